@@ -93,7 +93,7 @@ def all_pairs(count):
 
 def surface(camera, pixels):
     """World points [P, 3] that pixels [P, 2] see."""
-    centre = camera.center
+    center = camera.center
     rays = np.ones((len(pixels), 3))
     rays[:, :2] = (pixels - camera.K[[0, 1], 2]) / camera.K[[0, 1], [0, 1]]
     rays = rays @ camera.viewmat[:3, :3]
@@ -103,11 +103,11 @@ def surface(camera, pixels):
         ([1.5, 0.5, 0.6], 0.5, False),
         ([0.0, 0.0, 0.0], 8.0, True),
     ):
-        offset = centre - middle
+        offset = center - middle
         a, b = (rays * rays).sum(axis=1), rays @ offset
         root = b * b - a * (offset @ offset - radius**2)
         hit = (-b + (1 if inside else -1) * np.sqrt(np.maximum(root, 0.0))) / a
         distance = np.where((root > 0) & (hit > 0) & (hit < distance), hit, distance)
-    floor = (1.0 - centre[1]) / np.where(np.abs(rays[:, 1]) > 1e-12, rays[:, 1], 1e-12)
+    floor = (1.0 - center[1]) / np.where(np.abs(rays[:, 1]) > 1e-12, rays[:, 1], 1e-12)
     distance = np.where((floor > 0) & (floor < distance), floor, distance)
-    return centre + rays * distance[:, None]
+    return center + rays * distance[:, None]

@@ -1,13 +1,14 @@
-"""A stand-in for Ray: what igsr uses of it, in this process (the real: test_blocks_ray.py)."""
+"""A stand-in for the parts of Ray that igsr uses, in this process; test_blocks_ray.py uses Ray."""
 
 from __future__ import annotations
 
+import functools
 import sys
 import types
 
 
 class StandInRay(types.ModuleType):
-    """Calls run when they are waited for, the last one first."""
+    """A module that runs calls when their results are requested, the last call first."""
 
     __version__ = "2.50.0"
 
@@ -45,7 +46,7 @@ class StandInRay(types.ModuleType):
 
         def decorate(function):
             class Remote:
-                remote = staticmethod(lambda *arguments: (function, arguments))
+                remote = staticmethod(lambda *arguments: functools.partial(function, *arguments))
                 options = staticmethod(lambda **_: Remote)
 
             return Remote
@@ -56,9 +57,8 @@ class StandInRay(types.ModuleType):
         return references[-1:], references[:-1]
 
     def get(self, reference, timeout=None):
-        function, arguments = reference
         try:
-            return function(*arguments)
+            return reference()
         except tuple(vars(self.exceptions).values()):
             raise
         except Exception as error:
@@ -71,7 +71,7 @@ class StandInRay(types.ModuleType):
 
 
 def stand_in_ray(monkeypatch) -> StandInRay:
-    """Takes the place of the module ray."""
+    """Replace the module ray."""
     ray = StandInRay()
     strategies = types.ModuleType("ray.util.scheduling_strategies")
     strategies.NodeAffinitySchedulingStrategy = lambda node, soft: node

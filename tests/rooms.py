@@ -26,16 +26,16 @@ TEXELS = 24.0
 def camera(angle: float, focal: float = 200.0, width: int = 240, height: int = 180) -> Camera:
     """A camera on an arc about the room's middle, looking at it; angle in radians."""
     middle = np.array([0.0, 0.0, 3.0])
-    centre = middle + 4.0 * np.array(
+    center = middle + 4.0 * np.array(
         [np.sin(angle), -0.1 + 0.1 * np.cos(7.0 * angle), -np.cos(angle)]
     )
-    z = middle - centre
+    z = middle - center
     z /= np.linalg.norm(z)
     x = np.cross([0.0, 1.0, 0.0], z)
     x /= np.linalg.norm(x)
     viewmat = np.eye(4)
     viewmat[:3, :3] = np.stack([x, np.cross(z, x), z])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ centre
+    viewmat[:3, 3] = -viewmat[:3, :3] @ center
     return Camera(viewmat, intrinsic_matrix(focal, focal, width / 2, height / 2), width, height)
 
 

@@ -6,10 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
 from igsr import rasterization
-from igsr.capture import Camera, Capture, View
+from igsr.capture import Camera, Capture, PseudoView, View
 from igsr.fitting import fit_capture
 from igsr.rendering.renders import render
 from igsr.splats import Splats
@@ -62,15 +63,15 @@ def splats(count=40, degree=1, seed=0, origin=(0.0, 0.0, 0.0)):
     )
 
 
-def ring_camera(angle, size=48, distance=4.0, centre=(0.0, 0.0, 0.0)):
-    """A camera on a ring in the x-z plane, y down, looking at ``centre``."""
+def ring_camera(angle, size=48, distance=4.0, center=(0.0, 0.0, 0.0)):
+    """A camera on a ring in the x-z plane, y down, looking at ``center``."""
     back = np.array([np.sin(angle), 0.0, -np.cos(angle)])
     z = -back
     y = np.array([0.0, 1.0, 0.0])
     x = np.cross(y, z)
     viewmat = np.eye(4)
     viewmat[:3, :3] = np.stack([x, y, z])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ (np.asarray(centre) + distance * back)
+    viewmat[:3, 3] = -viewmat[:3, :3] @ (np.asarray(center) + distance * back)
     K = np.array([[1.5 * size, 0.0, size / 2], [0.0, 1.5 * size, size / 2], [0.0, 0.0, 1.0]])
     return Camera(viewmat, K, size, size)
 
@@ -84,7 +85,7 @@ def perturbed_camera(camera, degrees, moved, seed):
     rotation *= np.sign(np.diag(rotation))
     viewmat = np.eye(4)
     viewmat[:3, :3] = rotation @ camera.viewmat[:3, :3]
-    center = camera.centre + moved * random.normal(size=3) / np.sqrt(3.0)
+    center = camera.center + moved * random.normal(size=3) / np.sqrt(3.0)
     viewmat[:3, 3] = -viewmat[:3, :3] @ center
     return replace(camera, viewmat=viewmat)
 
@@ -105,6 +106,12 @@ def capture(views=8, size=48, alpha=False, scene=None, arc=2.0 * np.pi):
         split = "test" if i % 4 == 0 else "train"
         result.append(View(f"photos/{i:02d}.png", camera, split, image))
     return Capture(Path("made-up"), result)
+
+
+def pseudo_view(view, **changes):
+    """The view as a pseudo-view, by default with a weight of 1 for each pixel."""
+    weights = np.ones(view.image.shape[:2], np.float32)
+    return PseudoView(**{**vars(view), "weights": weights, **changes})
 
 
 def write_capture(folder, made):
@@ -168,6 +175,13 @@ def fit_with_cameras(capture, steps=None, **options):
     """The splats of a fit, and the capture with fitted cameras, exposures and masks."""
     result = fit_capture(capture, steps=steps, **options)
     return result.splats, result.capture
+
+
+def resumed_fit(capture, checkpoint, stop, **options):
+    """The result of a fit that a listener ends at step ``stop`` and that is then resumed."""
+    with pytest.raises(Stop):
+        fit_capture(capture, checkpoint=checkpoint, report=stop_at(stop), **options)
+    return fit_capture(capture, checkpoint=checkpoint, resume=True, **options)
 
 
 class Stop(Exception):

@@ -39,13 +39,13 @@ def cameras_of(alignment):
     return [photo.camera for photo in alignment.photos if photo is not None]
 
 
-def assert_exact(alignment, scene, photos=None, degrees=1e-3, centre=1e-4, focal=1e-3):
+def assert_exact(alignment, scene, photos=None, degrees=1e-3, center=1e-4, focal=1e-3):
     photos = range(len(scene.cameras)) if photos is None else photos
     truth = [scene.cameras[i] for i in photos]
     found = [alignment.photos[i].camera for i in photos]
     errors = pose_errors(found, truth)
     assert errors["rotation"] < degrees
-    assert errors["centre"] < centre
+    assert errors["center"] < center
     for camera, true_camera in zip(found, truth, strict=True):
         np.testing.assert_allclose(camera.K, true_camera.K, rtol=focal, atol=1e-9)
         assert (camera.width, camera.height) == (true_camera.width, true_camera.height)
@@ -125,7 +125,7 @@ def test_fifty_photos_in_a_sliding_window():
     pairs = [(i, j) for i, j in all_pairs(50) if abs(i - j) <= 2]
     alignment = align(scene.predictions(pairs), scene.photos(), steps=1)
     # Rounding errors accumulate along 49 edges.
-    assert_exact(alignment, scene, degrees=0.02, centre=1e-3)
+    assert_exact(alignment, scene, degrees=0.02, center=1e-3)
 
 
 def test_thinned_grids_give_every_depth(monkeypatch):
@@ -149,10 +149,10 @@ def test_noise_is_averaged():
     found = align(predictions, scene.photos())
     assert found.start_loss == begun.loss == begun.start_loss
     assert found.loss < found.start_loss
-    assert_exact(found, scene, degrees=0.3, centre=0.05, focal=5e-3)
+    assert_exact(found, scene, degrees=0.3, center=0.05, focal=5e-3)
     before, after = (pose_errors(cameras_of(a), scene.cameras) for a in (begun, found))
     assert after["rotation"] < 0.5 * before["rotation"]
-    assert after["centre"] < 0.5 * before["centre"]
+    assert after["center"] < 0.5 * before["center"]
 
 
 def test_a_confident_half_of_the_pixels_suffices():
@@ -166,8 +166,8 @@ def test_a_confident_half_of_the_pixels_suffices():
         return points, np.where(wrong, 1.05, confidence)
 
     predictions = scene.predictions(spoil=spoil)
-    assert_exact(align(predictions, scene.photos(), steps=0), scene, degrees=0.05, centre=5e-3)
-    assert_exact(align(predictions, scene.photos(), steps=60), scene, degrees=0.02, centre=2e-3)
+    assert_exact(align(predictions, scene.photos(), steps=0), scene, degrees=0.05, center=5e-3)
+    assert_exact(align(predictions, scene.photos(), steps=60), scene, degrees=0.02, center=2e-3)
 
 
 def test_the_order_of_photos_does_not_matter():
@@ -183,7 +183,7 @@ def test_the_order_of_photos_does_not_matter():
     other = cameras_of(align(shuffled[::-1], [photos[i] for i in order], steps=150))
     errors = pose_errors([other[i] for i in place], straight)
     assert errors["rotation"] < 5e-3
-    assert errors["centre"] < 1e-3
+    assert errors["center"] < 1e-3
     np.testing.assert_allclose(other[0].K[0, 0], straight[0].K[0, 0], rtol=1e-3)
 
 

@@ -10,20 +10,21 @@ import pytest
 import rooms
 from scenes import perturbed_camera
 
+from igsr._internal.part_usage import Usage
 from igsr.capture.types import PoseEvidence
-from igsr.capture.write_cameras import write_cameras
+from igsr.capture.write_transforms import write_cameras
 from igsr.errors import IgsrError
 from igsr.fitting.pose_priors import pose_priors
 from igsr.geometry.pose_errors import pose_accuracy, pose_errors
 from igsr.geometry.similarity import similarity_between
-from igsr.pose import FoundCameras, all_evidence, read_found
+from igsr.pose import all_evidence
 from igsr.pose.alignment import AlignedPhoto
 from igsr.pose.all_evidence import with_all_evidence
+from igsr.pose.cameras_file import KeptCameras, read_cameras_file, write_cameras_file
 from igsr.pose.colmap import Colmap
 from igsr.pose.da3.estimator import Da3
 from igsr.pose.da3.prediction import resampling_of
-from igsr.pose.find import chosen_estimator
-from igsr.pose.registry import ESTIMATORS
+from igsr.pose.found_cameras import FoundCameras
 
 COUNT = 5
 
@@ -100,7 +101,7 @@ def test_inaccurate_cameras_are_corrected(truth, photos, colmap_places_none):
     assert found.warnings == []
     after = pose_errors(found.cameras, truth)
     assert after["rotation"] < 0.1
-    assert after["centre"] < 0.1 * before["centre"]
+    assert after["center"] < 0.1 * before["center"]
     np.testing.assert_allclose([camera.K[0, 0] for camera in found.cameras], 200.0, rtol=0.01)
     # World and unit are close to the prediction.
     assert similarity_between(found.cameras, truth).scale == pytest.approx(1.0, abs=0.1)
@@ -138,7 +139,7 @@ def test_a_photo_without_matches_keeps_its_prediction(truth, photos, monkeypatch
     known, predicted_only = found.evidence[0], found.evidence[2]
     assert predicted_only.rotation > 10.0 * known.rotation
     assert 0.5 < predicted_only.rotation < 4.0
-    assert 0.02 < predicted_only.centre / world.scale < 0.4
+    assert 0.02 < predicted_only.center / world.scale < 0.4
 
 
 def test_photos_without_matches_keep_their_predictions(truth, photos):
@@ -175,7 +176,7 @@ def test_a_wrong_depth_of_one_photo_moves_no_other(truth, photos, colmap_places_
     start[1] = replace(start[1], depth=(3.0 * wrong).astype(np.float32))
     moved = pose_errors(together(photos, start).cameras, truth)
     assert moved["rotation"] < 2.0 * right["rotation"]
-    assert moved["centre"] < 2.0 * right["centre"]
+    assert moved["center"] < 2.0 * right["center"]
 
 
 def test_an_adjustment_far_from_the_prediction_is_not_used(
@@ -235,7 +236,7 @@ def test_portrait_landscape_and_a_principal_point_off_the_middle(colmap_places_n
         camera.K[0, 2] += 0.04 * camera.width
     photos = [replace(photo, device="phone") for photo in rooms.photos(cameras)]
     start = [
-        replace(one, camera=replace(one.camera, K=_centred(one.camera)))
+        replace(one, camera=replace(one.camera, K=_centerd(one.camera)))
         for one in predicted(cameras)
     ]
     found = together(photos, start)
@@ -245,7 +246,7 @@ def test_portrait_landscape_and_a_principal_point_off_the_middle(colmap_places_n
     assert pose_accuracy(found.cameras, cameras)["rotation"] < 0.3 * before
 
 
-def _centred(camera):
+def _centerd(camera):
     K = camera.K.copy()
     K[:2, 2] = camera.width / 2, camera.height / 2
     return K
@@ -289,9 +290,11 @@ def test_evidence_is_kept_and_written(truth, photos, tmp_path):
     blank = replace(photos[2], image=np.full_like(photos[2].image, 128))
     shown = [*photos[:2], blank, *photos[3:]]
     found = Da3(RoughPredictor(truth))(shown)
-    kept = FoundCameras.of(shown, found, {"estimator": "da3"})
-    (tmp_path / "found.npz").write_bytes(kept.to_bytes())
-    again = read_found(tmp_path / "found.npz")
+    kept = KeptCameras(
+        FoundCameras.of(shown, found, {"estimator": "da3"}), {}, Usage(0.0, 0.0, None)
+    )
+    write_cameras_file(tmp_path / "cameras.npz", kept)
+    again = read_cameras_file(tmp_path / "cameras.npz").found
     assert again.estimate.evidence == found.evidence
     capture = again.capture(tmp_path, shown)
     assert capture.views[2].pose_evidence.rests_on == "network"
@@ -306,27 +309,12 @@ def test_evidence_is_kept_and_written(truth, photos, tmp_path):
     assert max(known[:2] + known[3:]) < 0.2 * known[2]
 
 
-def test_auto_chooses_a_network_with_weights(monkeypatch):
-    for name, there in (("dust3r", True), ("da3", True), ("colmap", True)):
-        entry = replace(ESTIMATORS[name], ready=lambda options, there=there: there)
-        monkeypatch.setitem(ESTIMATORS, name, entry)
-    assert chosen_estimator("auto", {}) == "dust3r"
-    assert chosen_estimator("auto", {"matcher": "sift"}) == "da3"  # DUSt3R has no matcher
-    for name in ("dust3r", "da3"):
-        gone = replace(ESTIMATORS[name], ready=lambda options: False)
-        monkeypatch.setitem(ESTIMATORS, name, gone)
-        left = "da3" if name == "dust3r" else "colmap"
-        assert chosen_estimator("auto", {}) == left
-    with pytest.raises(IgsrError, match="graph is no option of colmap"):
-        chosen_estimator("auto", {"graph": "complete"})
-
-
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
         (("hope", 0.1, 0.1), "rests_on is 'hope'"),
         (("network", -1.0, 0.1), "the rotation of pose_evidence is -1.0"),
-        (("network", 0.1, np.inf), "the centre of pose_evidence is inf"),
+        (("network", 0.1, np.inf), "the center of pose_evidence is inf"),
     ],
 )
 def test_invalid_evidence(fields, message):

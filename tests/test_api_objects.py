@@ -168,7 +168,7 @@ def rasterized(tensors, camera, viewmat):
 @pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (3.0, -2.0, 1.5)])
 def test_rasterization_of_to_torch_equals_render(antialiased, origin):
     splats = dataclasses.replace(scenes.splats(degree=2, origin=origin), antialiased=antialiased)
-    camera = scenes.ring_camera(0.7, centre=origin)
+    camera = scenes.ring_camera(0.7, center=origin)
     expected = igsr.render(splats, camera, backend="cpu")
     color, alpha, _ = rasterized(splats.to_torch(), camera, camera.viewmat)
     assert expected.alpha.max() > 0.5
@@ -179,7 +179,7 @@ def test_rasterization_of_to_torch_equals_render(antialiased, origin):
 def test_to_torch_keeps_far_scenes_precise():
     far = (5e6, 4e5, 30.0)
     splats = scenes.splats(origin=far)
-    camera = scenes.ring_camera(0.7, centre=far)
+    camera = scenes.ring_camera(0.7, center=far)
     viewmat = camera.viewmat.copy()
     viewmat[:3, 3] += viewmat[:3, :3] @ splats.origin
     color, _, _ = rasterized(splats.to_torch(origin=splats.origin), camera, viewmat)

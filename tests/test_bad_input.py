@@ -1,7 +1,10 @@
-"""What ``rasterization`` and ``render`` refuse, and that the message begins with the name."""
+"""Bad arguments of ``rasterization``, ``render`` and fits are named by the error message."""
 
 from __future__ import annotations
 
+import inspect
+
+import gsplat
 import numpy as np
 import pytest
 import scenes
@@ -104,76 +107,26 @@ BAD = {
     "backend unknown": {"backend": "abacus"},
     "backend None": {"backend": None},
     "backend list": {"backend": ["cpu"]},
-    # gsplat's arguments that this renderer does not implement
-    "tile_size": {"tile_size": 8},
-    "sparse_grad": {"sparse_grad": True},
-    "distributed": {"distributed": True},
-    "camera_model": {"camera_model": "fisheye"},
-    "segmented": {"segmented": True},
-    "covars": {"covars": torch.eye(3).repeat(5, 1, 1)},
-    "with_ut": {"with_ut": True},
-    "with_eval3d": {"with_eval3d": True},
-    "radial_coeffs": {"radial_coeffs": torch.zeros(2, 6)},
-    "tangential_coeffs": {"tangential_coeffs": torch.zeros(2, 2)},
-    "thin_prism_coeffs": {"thin_prism_coeffs": torch.zeros(2, 4)},
-    "ftheta_coeffs": {"ftheta_coeffs": object()},
-    "rolling_shutter": {"rolling_shutter": 1},
-    "viewmats_rs": {"viewmats_rs": torch.eye(4).repeat(2, 1, 1)},
-    "macro_tile": {"macro_tile": True},
-    "return_normals": {"return_normals": True},
-    "global_z_order": {"global_z_order": False},
-    "rays": {"rays": torch.zeros(2, 20, 24, 6)},
-    "lidar_coeffs": {"lidar_coeffs": object()},
-    "external_distortion_coeffs": {"external_distortion_coeffs": object()},
-    "ut_params": {"ut_params": object()},
-    "extra_signals": {"extra_signals": torch.zeros(5, 2)},
-    "extra_signals_sh_degree": {"extra_signals_sh_degree": 3},
-    "renderer_config": {"renderer_config": object()},
-    "nht_params": {"nht_params": object()},
-    "render_mode hit distance": {"render_mode": "RGB-d"},
-    "tile_size array": {"tile_size": torch.ones(2)},
 }
 
-
-def test_the_scene_that_is_broken_below_renders():
-    color, _, _ = call({})
-    assert color.shape == (2, 20, 24, 3)
-
-
-def test_numpy_numbers_are_numbers():
-    numbers = {"near_plane": np.float32(0.5), "eps2d": np.float64(0.25), "sh_degree": np.int64(2)}
-    plain = {"near_plane": 0.5, "eps2d": 0.25}
-    assert torch.equal(call(numbers)[0], call(plain)[0])
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_bad_argument_is_named_first(case):
-    with pytest.raises(ValueError) as raised:  # noqa: PT011 - the message is checked below
-        call(BAD[case])
-    name = case.split()[0]
-    assert str(raised.value).startswith(name), raised.value
-
-
-def test_gsplats_own_defaults_are_accepted():
-    import inspect
-
-    import gsplat
-
-    ours = inspect.signature(rasterization).parameters
-    theirs = inspect.signature(gsplat.rasterization).parameters
-    defaults = {
-        name: parameter.default
-        for name, parameter in theirs.items()
-        if parameter.default is not inspect.Parameter.empty
-    }
-    for name, default in defaults.items():
-        if name in ours:
-            assert ours[name].default == default, name
-    color, _, _ = call({**defaults, "sh_degree": 2})
-    assert torch.equal(color, call({"backgrounds": None})[0])
-
-
-#: Arguments of gsplat's development branch that 1.5 has not, with their defaults there.
+#: gsplat's arguments that igsr does not implement, with another value than the default.
+UNSUPPORTED = {
+    "sparse_grad": True,
+    "distributed": True,
+    "camera_model": "fisheye",
+    "segmented": True,
+    "covars": torch.eye(3).repeat(5, 1, 1),
+    "with_ut": True,
+    "with_eval3d": True,
+    "radial_coeffs": torch.zeros(2, 6),
+    "tangential_coeffs": torch.zeros(2, 2),
+    "thin_prism_coeffs": torch.zeros(2, 4),
+    "ftheta_coeffs": object(),
+    "rolling_shutter": 1,
+    "viewmats_rs": torch.eye(4).repeat(2, 1, 1),
+    "render_mode": "RGB-d",
+}
+#: Those of gsplat's development branch, with their defaults.
 NEWER = {
     "tile_size": None,
     "macro_tile": False,
@@ -188,6 +141,38 @@ NEWER = {
     "renderer_config": None,
     "nht_params": None,
 }
+UNSUPPORTED |= {
+    name: torch.ones(2) if default is None else not default for name, default in NEWER.items()
+}
+BAD |= {f"{name} unsupported": {name: value} for name, value in UNSUPPORTED.items()}
+
+
+def test_numpy_numbers_are_numbers():
+    numbers = {"near_plane": np.float32(0.5), "eps2d": np.float64(0.25), "sh_degree": np.int64(2)}
+    color, _, _ = call(numbers)
+    assert color.shape == (2, 20, 24, 3)
+    assert torch.equal(color, call({"near_plane": 0.5, "eps2d": 0.25})[0])
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_messages_begin_with_the_name_of_a_bad_argument(case):
+    with pytest.raises(ValueError, match=f"^{case.split()[0]}"):
+        call(BAD[case])
+
+
+def test_defaults_of_gsplat_are_accepted():
+    ours, theirs = (
+        {
+            name: parameter.default
+            for name, parameter in inspect.signature(function).parameters.items()
+            if parameter.default is not inspect.Parameter.empty
+        }
+        for function in (rasterization, gsplat.rasterization)
+    )
+    for name in ours.keys() & theirs.keys():
+        assert ours[name] == theirs[name], name
+    color, _, _ = call({**theirs, "sh_degree": 2})
+    assert torch.equal(color, call({"backgrounds": None})[0])
 
 
 def test_defaults_of_newer_gsplat_are_accepted():
@@ -196,10 +181,10 @@ def test_defaults_of_newer_gsplat_are_accepted():
     assert meta["tile_size"] == 16
 
 
-def test_only_the_head_is_positional():
+def test_only_the_first_arguments_are_positional():
     scene = scenes.torch_scene()
-    head = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks")
-    given = [scene[name] for name in head]
+    names = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks")
+    given = [scene[name] for name in names]
     color, _, _ = rasterization(*given, 24, 20, sh_degree=2, backend="cpu")
     assert torch.equal(color, call({**scene, "backgrounds": None})[0])
     with pytest.raises(TypeError, match="positional"):
@@ -208,30 +193,29 @@ def test_only_the_head_is_positional():
         call({"near": 0.01})
 
 
-def test_what_is_not_supported_says_what_to_do_instead():
+def test_messages_on_unsupported_arguments_name_an_alternative():
     with pytest.raises(ValueError, match=r"return_normals: .*render_normals=True"):
         call({"return_normals": True})
-    for model, instead in (
+    for model, alternative in (
         ("ortho", "a pinhole far off: move it back"),
         ("fisheye", "as igsr.load_capture makes of fisheye lenses"),
         ("ftheta", "give pinhole views of the photos"),
         ("panorama", "gsplat's others are ortho, fisheye, ftheta"),
     ):
-        with pytest.raises(ValueError, match=f"camera_model: only 'pinhole' .*{instead}"):
+        with pytest.raises(ValueError, match=f"camera_model: only 'pinhole' .*{alternative}"):
             call({"camera_model": model})
 
 
-def test_a_pinhole_far_off_is_nearly_orthographic():
-    """What the message on "ortho" advises: two splats at different depths keep their distance."""
-    scale, back = 10.0, 200.0
-    means = torch.tensor([[-0.5, 0.0, -0.5], [0.5, 0.0, 0.5]])
+def test_a_distant_pinhole_is_nearly_orthographic():
+    """As the message on "ortho" advises: splats at different depths keep their distance."""
+    scale, distance = 10.0, 200.0
     viewmat = torch.eye(4)
-    viewmat[2, 3] = back
-    K = torch.tensor([[scale * back, 0, 16], [0, scale * back, 16], [0, 0, 1]])
-    places = []
-    for index in range(2):
+    viewmat[2, 3] = distance
+    K = torch.tensor([[scale * distance, 0, 16], [0, scale * distance, 16], [0, 0, 1]])
+    columns = []
+    for mean in ([-0.5, 0.0, -0.5], [0.5, 0.0, 0.5]):
         _, alpha, _ = rasterization(
-            means[index : index + 1],
+            torch.tensor([mean]),
             torch.tensor([[1.0, 0, 0, 0]]),
             torch.full((1, 3), 0.1),
             torch.tensor([0.9]),
@@ -241,14 +225,14 @@ def test_a_pinhole_far_off_is_nearly_orthographic():
             32,
             32,
         )
-        weights = alpha[0, ..., 0].double()
-        places.append(float((weights.sum(0) * (torch.arange(32) + 0.5)).sum() / weights.sum()))
-    assert abs(places[1] - places[0] - scale) < 0.05
+        weights = alpha[0, ..., 0].double().sum(0)
+        columns.append(float((weights * (torch.arange(32) + 0.5)).sum() / weights.sum()))
+    assert abs(columns[1] - columns[0] - scale) < 0.05
 
 
 @pytest.mark.parametrize("slot", ["means", "quats", "scales", "opacities", "colors"])
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 1e38])
-def test_one_poisoned_splat_spoils_nothing_else(slot, value):
+def test_a_splat_that_is_not_finite_changes_no_other(slot, value):
     scene = scenes.torch_scene(count=8)
     kept = [0, 1, 2, 4, 5, 6, 7]
     poisoned = {name: tensor.clone() for name, tensor in scene.items()}
@@ -260,7 +244,7 @@ def test_one_poisoned_splat_spoils_nothing_else(slot, value):
     (color.sum() + alpha.sum()).backward()
     for name, tensor in poisoned.items():
         assert torch.isfinite(tensor.grad).all(), name
-    # An infinitely dark splat is black, a splat with any other infinity is not drawn at all.
+    # An infinitely dark splat is black; splats with other infinities are not drawn.
     if not np.isfinite(value) and (slot, value) != ("colors", -float("inf")):
         without = {
             name: tensor[kept] if len(tensor) == 8 else tensor for name, tensor in scene.items()
@@ -275,7 +259,7 @@ def test_render_names_a_bad_background(background):
         igsr.render(scenes.splats(), scenes.ring_camera(0.0), background, "cpu")
 
 
-def test_render_names_what_the_renderer_refuses():
+def test_render_names_bad_cameras_and_backends():
     K = np.array([[72.0, 0.0, 24.0], [0.0, 72.0, 24.0], [0.0, 0.0, 1.0]])
     for camera, backend, word in (
         (scenes.ring_camera(0.0), "abacus", "backend"),
@@ -303,20 +287,12 @@ def test_core_names_arrays_of_the_wrong_kind():
             _core.project(**{**good, name: wrong})
 
 
-def test_a_fit_says_what_it_takes(tmp_path):
-    with pytest.raises(igsr.IgsrError, match=r"capture must be a Capture, not str; igsr\.load"):
-        scenes.fit("photos")
-    capture = scenes.capture(views=2, size=24)
-    with pytest.raises(igsr.IgsrError, match="backend must be auto, cpu or gpu, not 'tpu'"):
-        scenes.fit(capture, steps=1, backend="tpu")
-
-
 @pytest.mark.parametrize("command", ["fit", "refine"])
-def test_an_out_that_is_a_file_is_told_first(command, tmp_path, igsr_here):
+def test_an_out_that_is_a_file_is_refused_first(command, tmp_path, igsr_here):
     file = tmp_path / "scene.ply"
     file.write_text("mine")
     for out in (file, file / "below"):
         refused = igsr_here(command, tmp_path / "nowhere", "--out", out)
         assert refused.returncode == 1
-        assert refused.stderr == f"--out {out}: {file} is a file; name a folder.\n"
+        assert refused.stderr == f"out is {out}, and {file} is a file; name a folder.\n"
     assert file.read_text() == "mine"

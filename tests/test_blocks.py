@@ -14,20 +14,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scenes
+from ray_stand_in import stand_in_ray
 
 import igsr
 from igsr._internal.worker_processes import WorkerLostError
-from igsr.blocks import (
-    BlockOptions,
-    assignment,
-    fit_in_blocks,
-    run,
-    runner,
-    seams,
-    task_making,
-    worker,
-)
+from igsr.blocks import BlockOptions, fit_in_blocks, plan, run, runner, seams, tasks, worker
 from igsr.blocks.tasks import load_splats, save_splats
+from igsr.fitting import fit_capture
 from igsr.splats import joined, subset
 from igsr_lab.large_scenes import towns
 
@@ -36,16 +30,16 @@ SETTINGS = {"steps": 120, "max_splats": 1200}
 
 
 #: Photos of 48 pixels are made smaller for the coarse fit, too; and two houses are a seam.
-SMALL = "from igsr.blocks import assignment, task_making; "
-SMALL += "task_making.COARSE_SIZES = (12, 400); assignment.ACROSS = 0.05"
+SMALL = "from igsr.blocks import plan, tasks; "
+SMALL += "tasks.MIN_COARSE_SIDE_PX = 12; plan.MIN_SEAM_VISIBILITY = 0.05"
 
 
 @pytest.fixture(autouse=True, scope="module")
 def small_scenes():
-    usual = task_making.COARSE_SIZES, assignment.ACROSS
+    usual = tasks.MIN_COARSE_SIDE_PX, plan.MIN_SEAM_VISIBILITY
     exec(SMALL)
     yield
-    task_making.COARSE_SIZES, assignment.ACROSS = usual
+    tasks.MIN_COARSE_SIDE_PX, plan.MIN_SEAM_VISIBILITY = usual
 
 
 def options(**changed):
@@ -87,8 +81,9 @@ def test_a_scene_in_blocks_is_one_scene(whole, folder):
     coarse = igsr.evaluate(load_splats(out / "blocks/coarse/splats.npz"), capture, "train")
     assert igsr.evaluate(splats, capture, "train").psnr > coarse.psnr + 1.0
     assert report["seams"]["photos"] > 0
-    assert {one.name for one in seen[-1]} == {"coarse", "block-000", "block-001"}
-    assert all(one.work == 1.0 and one.text == "done" for one in seen[-1])
+    assert [event.stage for event in (seen[0], seen[-1])] == ["coarse fit", "fit blocks"]
+    assert seen[-1].values == {"block-000": 1.0, "block-001": 1.0}
+    assert seen[-1].done == seen[-1].total == 2
     assert not list((out / "blocks").rglob("checkpoint.npz"))
     page = (out / "report.html").read_text()
     across = [view["name"] for view in report["views"] if view["across"]]
@@ -100,7 +95,7 @@ def test_a_scene_in_blocks_is_one_scene(whole, folder):
 
 def test_what_is_done_is_not_done_again(whole, folder, monkeypatch):
     splats, _, out, _ = whole
-    monkeypatch.setattr(runner, "in_own_process", lambda *_: pytest.fail("a task was done again"))
+    monkeypatch.setattr(runner, "in_a_process", lambda *_: pytest.fail("a task was done again"))
     again, _ = fit_in_blocks(folder, out, options())
     assert again == splats
 
@@ -111,10 +106,38 @@ def test_a_block_that_is_lost_is_done_alone_with_the_same_bits(whole, folder, tm
     copy = tmp_path / "copy"
     shutil.copytree(out, copy)
     (copy / "blocks/block-001/splats.npz").unlink()
+    # Checkpoints of other fits are not used.
+    checkpoint = copy / "blocks/block-001/checkpoint.npz"
+    fit_capture(igsr.load_capture(folder), steps=2, backend="cpu", checkpoint=checkpoint)
     again, other = fit_in_blocks(folder, copy, options())
     assert again == splats
     assert other["blocks"][0]["process"] == report["blocks"][0]["process"]
     assert other["blocks"][1]["process"] != report["blocks"][1]["process"]
+
+
+def test_blocks_over_ray_have_the_same_bits(whole, folder, tmp_path, monkeypatch):
+    ray = stand_in_ray(monkeypatch)
+    splats, _ = fit_in_blocks(folder, tmp_path, options(ray="auto"))
+    assert splats == whole[0]
+    assert not ray.running
+    assert ray.addresses == ["auto", "auto"]
+    # A machine with other instructions may give other bits.
+    for path in (tmp_path / "blocks").glob("block-*.json"):
+        row = json.loads(path.read_text())
+        path.write_text(json.dumps({**row, "host": "far", "instruction_set": "other"}))
+    with pytest.warns(UserWarning, match=r"^far: the instruction set is not .* other bits"):
+        fit_in_blocks(folder, tmp_path, options())
+
+
+def test_an_exception_of_the_listener_ends_the_run(folder, tmp_path):
+    def stop(event):
+        if event.stage == "coarse fit" and event.done == 1:
+            raise RuntimeError("stop here")
+
+    with pytest.raises(RuntimeError, match="stop here"):
+        fit_in_blocks(folder, tmp_path, options(), stop)
+    assert (tmp_path / "blocks/coarse.json").is_file()
+    assert not (tmp_path / "blocks/block-000").exists()
 
 
 def command(folder, out):
@@ -159,18 +182,18 @@ def dying(monkeypatch, times, name="block-001", error=None):
     """The task of this name ends so many times without a result."""
     left = [times]
 
-    def work(capture, task):
+    def work(run_task, task):
         if task.name == name and left[0]:
             left[0] -= 1
             raise error or WorkerLostError("A process ended without a result.")
-        return worker.do_task(capture, task)
+        return run_task(task)
 
-    monkeypatch.setattr(runner, "in_own_process", work)
+    monkeypatch.setattr(runner, "in_a_process", work)
 
 
 def test_a_worker_that_is_killed_once_is_begun_again(whole, folder, tmp_path, monkeypatch):
     dying(monkeypatch, 1)
-    with pytest.warns(UserWarning, match="block-001 was lost and is begun again"):
+    with pytest.warns(UserWarning, match="block-001 was lost and is started again"):
         splats, report = fit_in_blocks(folder, tmp_path, options())
     assert splats == whole[0]
     assert report["blocks"][1]["splats_part"] == 1.0
@@ -199,16 +222,16 @@ def test_a_disk_that_is_full_is_named(folder, tmp_path, monkeypatch):
         save_splats(Path("/dev/full/splats.npz"), splats)
 
     monkeypatch.setattr(worker, "save_splats", full)
-    monkeypatch.setattr(runner, "in_own_process", worker.do_task)
+    monkeypatch.setattr(runner, "in_a_process", lambda run_task, task: run_task(task))
     with pytest.raises(igsr.IgsrError, match=r"^coarse on .*: Cannot write /dev/full"):
         fit_in_blocks(folder, tmp_path, options())
 
 
 def test_a_photo_that_changes_meanwhile_is_named(folder, tmp_path, monkeypatch):
-    def changed(capture, task):
-        return worker.do_task(capture, replace(task, marks=["0" * 64] * len(task.marks)))
+    def changed(run_task, task):
+        return run_task(replace(task, marks=["0" * 64] * len(task.marks)))
 
-    monkeypatch.setattr(runner, "in_own_process", changed)
+    monkeypatch.setattr(runner, "in_a_process", changed)
     with pytest.raises(igsr.IgsrError, match=r"0001\.png was changed since the run began"):
         fit_in_blocks(folder, tmp_path, options())
 
@@ -222,7 +245,7 @@ def test_a_cell_without_photos_stays_coarse(whole, folder, tmp_path, monkeypatch
         return plan
 
     monkeypatch.setattr(run, "plan_blocks", without)
-    with pytest.warns(UserWarning, match="block-000 has no photos; it stays as coarse as it is"):
+    with pytest.warns(UserWarning, match="block-000 has no photos; it keeps the splats of"):
         splats, report = fit_in_blocks(folder, tmp_path, options())
     first, second = report["blocks"]
     assert not first["fitted"]
@@ -299,28 +322,28 @@ def test_frozen_splats_stay_and_are_not_returned(folder, tmp_path):
     usual = {"start": start, "frozen": frozen}
     for changed, message in (
         ({"start": None}, "frozen needs start"),
-        ({"frozen": replace(frozen, sh=frozen.sh[:, :1].copy())}, "frozen has splats of SH degree"),
-        ({"frozen": replace(frozen, origin=np.ones(3))}, "frozen and start have other origins"),
+        ({"frozen": replace(frozen, sh=frozen.sh[:, :1].copy())}, "frozen has SH degree 0 and"),
+        ({"frozen": replace(frozen, origin=np.ones(3))}, "frozen and start have different origins"),
         ({"frozen": replace(frozen, antialiased=True)}, "frozen has antialiased splats"),
     ):
         with pytest.raises(igsr.IgsrError, match=message):
             scenes.fit(capture, steps=5, backend="cpu", **(usual | changed))
 
 
-def test_seams_that_show_are_mended(tmp_path, monkeypatch):
+def test_visible_seams_are_fitted_again(tmp_path, monkeypatch):
     # One house, which the border cuts.
     capture = towns.town(1, 1, 16, 48, 36, points=200, sharp=1)
     folder, out = towns.written(capture, tmp_path / "house"), tmp_path / "out"
-    monkeypatch.setattr(seams, "VISIBLE", 100.0)
+    monkeypatch.setattr(seams, "VISIBLE_LOSS_DB", 100.0)
     splats, report = fit_in_blocks(folder, out, options(holdout=None))
     assert report["seams"]["photos"] > 4
-    assert "before_mending" not in report["seams"]
+    assert "before_seam_fit" not in report["seams"]
     # Whatever joining costs is too much.
-    monkeypatch.setattr(seams, "VISIBLE", -100.0)
-    again, mended = fit_in_blocks(folder, out, options(holdout=None))
-    before = mended["seams"]["before_mending"]
+    monkeypatch.setattr(seams, "VISIBLE_LOSS_DB", -100.0)
+    again, refitted = fit_in_blocks(folder, out, options(holdout=None))
+    before = refitted["seams"]["before_seam_fit"]
     assert before["psnr_joined"] == report["seams"]["psnr_joined"]
-    assert mended["seams"]["psnr_joined"] > before["psnr_joined"]
+    assert refitted["seams"]["psnr_joined"] > before["psnr_joined"]
     assert len(again) == len(splats)
     same = (again.means[:, None] == splats.means[None]).all(axis=2).any(axis=0)
     assert 0 < same.sum() < len(splats), "splats far from seams moved, or none near them did"

@@ -15,23 +15,23 @@ import pytest
 from PIL import Image
 
 import igsr
-from igsr.blocks.assignment import photos_across_seams, photos_of_blocks
-from igsr.blocks.cells import Cell, Ground, ground_of, split_into_cells
+from igsr.blocks.cells import Grid, grid_of, ground_axes, split_into_cells
+from igsr.blocks.crops import WHOLE, Box, box_around, cropped
 from igsr.blocks.manifest import Manifest, file_mark, read_manifest
-from igsr.blocks.options import BlockOptions
-from igsr.blocks.photo_parts import ALL, Box, box_of, boxes_of, cut_out
-from igsr.blocks.plan import blocks_for_memory, memory_of
-from igsr.blocks.reach import reaching_out
-from igsr.blocks.shares import shown_shares, tracked_shares
-from igsr.blocks.task_making import coarse_task
-from igsr.blocks.tasks import BlockPart
-from igsr.blocks.worker import depths_of_points, depths_of_scene
+from igsr.blocks.plan import assign_photos, blocks_for_memory, memory_of, photos_across_seams
+from igsr.blocks.tasks import BlockOptions, Context, Region, coarse_task
+from igsr.blocks.visibility import (
+    scene_depths,
+    splat_visibility,
+    track_depths,
+    track_visibility,
+    visible_boxes,
+)
 from igsr.capture import Camera, View
-from igsr.capture.image_files import PhotoHeader
-from igsr.capture.photos import Shot
+from igsr.capture.photos import PhotoHeader, Shot
 from igsr.capture.types import intrinsic_matrix
 from igsr.capture.undistort import Lens
-from igsr.fitting.photo_support import support_of
+from igsr.fitting.photo_statistics import photo_statistics
 from igsr_lab.large_scenes import towns
 
 
@@ -47,12 +47,12 @@ def test_cells_have_equally_many_cameras_and_cover_the_plane(count):
     places = random.normal(size=(91, 2)) * [5.0, 1.0]
     cells = split_into_cells(places, count)
     assert len(cells) == count
-    held = np.stack([cell.holds(places) for cell in cells])
+    held = np.stack([cell.contains(places) for cell in cells])
     assert (held.sum(axis=0) == 1).all(), "a camera lies in no cell, or in two"
     counts = held.sum(axis=1)
     assert counts.max() - counts.min() <= 2
     far = random.uniform(-1e6, 1e6, (1000, 2))
-    assert (np.stack([cell.holds(far) for cell in cells]).sum(axis=0) == 1).all()
+    assert (np.stack([cell.contains(far) for cell in cells]).sum(axis=0) == 1).all()
 
 
 def test_the_longer_side_is_split_and_borders_are_widened_by_a_fifth():
@@ -61,19 +61,17 @@ def test_the_longer_side_is_split_and_borders_are_widened_by_a_fifth():
     assert left.high == (4.5, np.inf)
     assert right.low == (4.5, -np.inf)
     assert left.side == (4.5, 0.0)
-    wide = left.widened()
+    wide = left.expanded()
     assert wide.high[0] == pytest.approx(4.5 + 0.1 * 4.5)
     assert wide.low == (-np.inf, -np.inf)
-    near = left.near_border(np.array([[4.4, 0.0], [4.6, 9.0], [3.0, 0.0]]), 0.05)
-    assert near.tolist() == [True, True, False]
     assert left.plain() == {"low": [None, None], "high": [4.5, None], "side": [4.5, 0.0]}
 
 
 def test_photos_at_one_place_are_not_torn_apart():
     places = np.repeat([[0.0, 0.0], [1.0, 0.0]], [7, 3], axis=0)
     left, right = split_into_cells(places, 2)
-    assert left.holds(places).sum() == 7
-    assert right.holds(places).sum() == 3
+    assert left.contains(places).sum() == 7
+    assert right.contains(places).sum() == 3
     with pytest.raises(igsr.IgsrError, match=r"3 photos at 1 places .* fewer --blocks"):
         split_into_cells(places, 3)
     with pytest.raises(igsr.IgsrError, match="5 photos at 1 places"):
@@ -82,12 +80,12 @@ def test_photos_at_one_place_are_not_torn_apart():
         split_into_cells(places[:4], 5)
 
 
-def camera(centre, up=(0.0, -1.0, 0.0), forward=(0.0, 0.0, 1.0)):
+def camera(center, up=(0.0, -1.0, 0.0), forward=(0.0, 0.0, 1.0)):
     z = np.array(forward)
     x = np.cross(-np.array(up), z)
     viewmat = np.eye(4)
     viewmat[:3, :3] = np.stack([x, np.cross(z, x), z])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ centre
+    viewmat[:3, 3] = -viewmat[:3, :3] @ center
     return Camera(viewmat, intrinsic_matrix(50.0, 50.0, 16.0, 12.0), 32, 24)
 
 
@@ -95,14 +93,14 @@ def camera(centre, up=(0.0, -1.0, 0.0), forward=(0.0, 0.0, 1.0)):
 def test_the_ground_is_level(kind):
     random = np.random.default_rng(3)
     spread = {"plane": (5, 0.1, 4), "line": (9, 0.01, 0.01), "ball": (3, 3, 3), "place": (0, 0, 0)}
-    centres = random.normal(size=(60, 3)) * spread[kind]
+    centers = random.normal(size=(60, 3)) * spread[kind]
     # A drone's photos of the ground have no up of their own; those of a street do.
     drone = kind == "plane"
     cameras = [
-        camera(centre, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)) if drone else camera(centre)
-        for centre in centres
+        camera(center, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)) if drone else camera(center)
+        for center in centers
     ]
-    axes = ground_of(cameras).axes
+    axes = ground_axes(cameras)
     assert axes @ axes.T == pytest.approx(np.eye(2), abs=1e-9)
     assert np.abs(axes[:, 1]).max() < 0.1, "the axes rise"
 
@@ -111,7 +109,7 @@ def test_photos_go_where_they_show_something():
     shown = np.array([[0.9, 0.0], [0.3, 0.6], [0.01, 0.1], [0.08, 0.09], [0.0, 0.0]])
     tracked = np.array([[0.0, 0.3], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
     near = np.array([[True, False], [True, False], [True, False], [True, False], [True, True]])
-    assert photos_of_blocks(shown, tracked, near).tolist() == [
+    assert assign_photos(np.maximum(shown, tracked), near).tolist() == [
         [True, True],  # the second by its tracks
         [True, True],
         [False, True],  # taken in the first, which it does not show: to the one that it shows most
@@ -127,30 +125,30 @@ def test_a_part_of_a_photo_shows_what_the_photo_shows_there():
     image = random.integers(0, 256, (80, 100, 3), np.uint8)
     depth = random.uniform(1.0, 2.0, (80, 100)).astype(np.float32)
     view = View("a.png", whole, "train", image, mask=image[..., 0] > 9, depth=depth)
-    part = cut_out(view, Box(0.255, 0.5, 0.75, 1.0))
+    part = cropped(view, Box(0.255, 0.5, 0.75, 1.0))
     assert part.image.shape == (40, 50, 3)
     assert (part.image == image[40:, 25:75]).all()
     assert (part.mask == view.mask[40:, 25:75]).all()
     assert (part.depth == depth[40:, 25:75]).all()
     assert part.image.base is None, "the whole photo stays in memory"
     assert part.camera.K[:2, 2].tolist() == [25.0, 0.0]
-    assert cut_out(view, ALL) is view
+    assert cropped(view, WHOLE) is view
     # As small as it may be, at the photo's edge, too; and all of a smaller photo.
     for box in (Box(0.0, 0.0, 0.01, 0.01), Box(0.99, 0.99, 1.0, 1.0), Box(0.5, 0.4, 0.5, 0.4)):
-        assert cut_out(view, box).image.shape == (24, 24, 3)
+        assert cropped(view, box).image.shape == (24, 24, 3)
     assert Box(0.9, 0.9, 1.0, 1.0).size(20, 10) == (20, 10)
 
 
 def test_boxes_hold_what_is_shown():
     share = np.zeros((24, 32))
     share[6:18, 8:24] = 1.0
-    assert box_of(share).plain() == [7 / 32, 5 / 24, 25 / 32, 19 / 24]
+    assert box_around(share) == Box(7 / 32, 5 / 24, 25 / 32, 19 / 24)
     share[2, 2] = 0.5  # a stray pixel
-    assert box_of(share).plain() == [7 / 32, 5 / 24, 25 / 32, 19 / 24]
-    assert box_of(np.zeros((24, 32))) == ALL
+    assert box_around(share) == Box(7 / 32, 5 / 24, 25 / 32, 19 / 24)
+    assert box_around(np.zeros((24, 32))) == WHOLE
     corner = np.zeros((24, 32))
     corner[0, 31] = 1.0
-    assert box_of(corner).plain() == [0.75, 0.0, 1.0, 0.25]
+    assert box_around(corner) == Box(0.75, 0.0, 1.0, 0.25)
 
 
 def test_a_block_has_the_part_of_a_photo_that_its_splats_are_in():
@@ -164,14 +162,14 @@ def test_a_block_has_the_part_of_a_photo_that_its_splats_are_in():
     )
     inside, wanted = np.eye(2, dtype=np.bool_), np.array([[True, True], [False, True]])
     cameras = [camera([0.0, 0.0, 0.0])] * 2
-    first, second = boxes_of(splats, cameras, inside, wanted, np.array([-1, 1]), "cpu")
+    first, second = visible_boxes(splats, cameras, inside, wanted, np.array([-1, 1]), "cpu")
     assert set(first) == {0, 1}
     assert set(second) == {1}
     assert first[0].right < 0.5 < first[1].left
     assert first[0].top == pytest.approx(1.0 - first[0].bottom, abs=0.05)
     assert first[1].top > 0.25
     # Where nothing is drawn, a photo shows what it shows most of.
-    assert second[1] == ALL
+    assert second[1] == WHOLE
 
 
 def test_parts_of_photos_take_less_memory(town):
@@ -189,20 +187,20 @@ def test_photos_of_many_places_tell_how_many_see_each():
     cameras = [camera([x, -4.0, z], (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)) for x, z in grid]
     image = np.zeros((24, 32, 3), np.uint8)
     views = [View(f"{k}.png", one, "train", image) for k, one in enumerate(cameras)]
-    assert support_of(views, np.full(100, 4.0)).seen_by == pytest.approx(2.8)
+    assert photo_statistics(views, np.full(100, 4.0)).overlap == pytest.approx(2.8)
     # Parts of photos look at what is in their own middle, and show less.
-    parts = [cut_out(view, Box(0.5, 0.0, 1.0, 1.0)) for view in views]
-    assert support_of(parts, np.full(100, 4.0)).seen_by == pytest.approx(1.0)
+    parts = [cropped(view, Box(0.5, 0.0, 1.0, 1.0)) for view in views]
+    assert photo_statistics(parts, np.full(100, 4.0)).overlap == pytest.approx(1.0)
 
 
 def test_depths_are_those_of_the_points_that_photos_see():
     capture = towns.town(2, 1, 6, 32, 24, points=100, sharp=1)
-    depths = depths_of_points(capture.views, capture.points)
+    depths = track_depths(capture.views, capture.points)
     assert np.median(depths) == pytest.approx(3.5, rel=0.3)
     unseen = [replace(capture.views[0], name="other.png")]
-    assert depths_of_points(unseen, capture.points) == [0.0]
-    assert depths_of_points(capture.views, replace(capture.points, tracks=None)) is None
-    assert depths_of_points(capture.views, None) is None
+    assert track_depths(unseen, capture.points) == [0.0]
+    assert track_depths(capture.views, replace(capture.points, tracks=None)) is None
+    assert track_depths(capture.views, None) is None
 
 
 @pytest.mark.parametrize(
@@ -219,7 +217,7 @@ def test_a_coarse_fit_takes_no_more_memory_than_a_block(blocks, splats, size, mo
     manifest = Manifest(Path(), shots, [header] * 3000, [""] * 3000, lambda: None)
     settings = {"max_splats": splats}
     options = BlockOptions(blocks=blocks, settings=settings)
-    task = coarse_task(manifest, None, Path("out"), options, blocks)
+    task = coarse_task(Context(Path("out"), options, manifest), None, blocks)
     assert task.max_size == size
     assert task.settings["transients"] == "off"
     if most is not None:
@@ -233,7 +231,6 @@ def test_a_coarse_fit_takes_no_more_memory_than_a_block(blocks, splats, size, mo
 
 def test_splats_that_reach_into_other_cells_are_no_blocks():
     cells = split_into_cells(np.stack([np.arange(8.0), np.zeros(8)], axis=1), 2)
-    ground = Ground(np.eye(3)[[0, 2]])
     border, side = cells[0].high[0], cells[0].side[0]
     # Half axes along x by turning a needle along z, and as they are.
     means = np.array([[1.0, 0, 0], [1.0, 0, 0], [-50.0, 0, 9], [border - 0.1, 0, 0], [6.0, 0, 0]])
@@ -250,13 +247,15 @@ def test_splats_that_reach_into_other_cells_are_no_blocks():
         np.zeros(5, np.float32),
         np.zeros((5, 1, 3), np.float32),
     )
-    assert reaching_out(splats, cells, ground).tolist() == [False, True, False, False, False]
-    # The block keeps what is its own alone, and fits no others.
-    part = BlockPart(
-        scene=None, ground=ground, cell=cells[0], fitted=cells[0].widened(), cells=tuple(cells)
-    )
-    assert part.moving(splats).tolist() == [True, False, True, True, False]
-    assert part.kept(splats).tolist() == [True, False, True, True, False]
+    grid = Grid(np.eye(3)[[0, 2]], cells)
+    assert grid.spanning(splats).tolist() == [False, True, False, False, False]
+    assert grid.near_borders(splats, 0.1).tolist() == [False, False, False, True, False]
+    block = Region(scene=None, scene_hash="", grid=grid, block=0)
+    assert block.trainable(splats).tolist() == [True, False, True, True, False]
+    assert block.kept(splats).tolist() == [True, False, True, True, False]
+    seams = Region(scene=None, scene_hash="", grid=grid, block=None)
+    assert seams.trainable(splats).tolist() == [False, False, False, True, False]
+    assert seams.kept(splats).all()
 
 
 def test_depths_are_those_of_the_scene():
@@ -270,7 +269,7 @@ def test_depths_are_those_of_the_scene():
     image = np.zeros((24, 32, 3), np.uint8)
     facing = View("a.png", camera([0.0, 0.0, 0.0]), "train", image)
     away = View("b.png", camera([0.0, 0.0, 0.0], forward=(0.0, 0.0, -1.0)), "train", image)
-    assert depths_of_scene([facing, away], splats, "cpu") == pytest.approx([4.0, 0.0], abs=0.2)
+    assert scene_depths([facing, away], splats, "cpu") == pytest.approx([4.0, 0.0], abs=0.2)
 
 
 def test_what_is_hidden_is_not_shown():
@@ -287,35 +286,27 @@ def test_what_is_hidden_is_not_shown():
         np.zeros((n, 4, 3), np.float32),
     )
     cameras = [camera([0.0, 0.0, 0.0]), camera([0.0, 0.0, 9.0], forward=(0.0, 0.0, -1.0))]
-    ground = ground_of([camera([x, 0.0, z]) for x in (0, 1, 2) for z in (0, 3)])
-    front = Cell((-np.inf, -np.inf), (np.inf, np.inf), (1.0, 1.0))
-    places = ground.places(np.array([[0.0, 0.0, 4.5]]))[0]
-    axis = int(np.abs(ground.axes[:, 2]).argmax())
-    low, high = [-np.inf, -np.inf], [np.inf, np.inf]
-    low[axis] = places[axis]
-    high[axis] = places[axis]
-    cells = [Cell(tuple(low), (np.inf, np.inf), (1, 1)), front]
-    cells.insert(0, Cell((-np.inf, -np.inf), tuple(high), (1, 1)))
-    shares = shown_shares(splats, cameras, cells, ground, "cpu")
-    nearer = 0 if ground.axes[axis, 2] > 0 else 1
-    assert shares[0, nearer] > 0.95
-    assert shares[0, 1 - nearer] < 0.05
-    assert shares[1, 1 - nearer] > 0.95
-    assert shares[:, 2] == pytest.approx(1.0, abs=1e-3)
+    is_near = means[:, 2] < 4.5
+    groups = np.stack([is_near, ~is_near, np.ones(n, np.bool_)], axis=1)
+    visibility = splat_visibility(splats, cameras, groups, "cpu")
+    assert visibility[0, 0] > 0.95
+    assert visibility[0, 1] < 0.05
+    assert visibility[1, 1] > 0.95
+    assert visibility[:, 2] == pytest.approx(1.0, abs=1e-3)
 
 
 def test_tracks_tell_what_photos_show(town):
     capture, _ = town
-    ground = ground_of([view.camera for view in capture.views])
-    places = ground.places(np.stack([view.camera.center for view in capture.views]))
-    cells = split_into_cells(places, 2)
+    grid = grid_of([view.camera for view in capture.views], 2)
+    centers = np.stack([view.camera.center for view in capture.views])
     names = [view.name for view in capture.views]
-    shares = tracked_shares(capture.points, names, cells, ground)
-    own = np.stack([cell.holds(places) for cell in cells], axis=1)
+    groups = grid.inside(grid.positions(capture.points.xyz))
+    shares = track_visibility(capture.points, names, groups)
+    own = grid.inside(grid.positions(centers))
     assert shares.sum(axis=1) == pytest.approx(1.0)
     assert shares[own].mean() > 0.6
     assert shares[~own].mean() < 0.4
-    assert tracked_shares(None, names, cells, ground).max() == 0.0
+    assert track_visibility(None, names, groups).max() == 0.0
 
 
 def test_a_manifest_decodes_nothing_and_marks_files(town, tmp_path, monkeypatch):
@@ -364,22 +355,22 @@ def made_up_capture(folder, count, points):
     with open(folder / "sparse/0/cameras.bin", "wb") as file:
         file.write(struct.pack("<QIiQQ", 1, 1, 1, 4000, 3000))
         file.write(struct.pack("<4d", 3000.0, 3000.0, 2000.0, 1500.0))
-    centres = np.stack(
+    centers = np.stack(
         [np.linspace(0.0, count / 10.0, count), np.full(count, -1.6), random.uniform(-4, 4, count)],
         axis=1,
     )
     xyz = random.uniform([0.0, -6.0, 4.0], [count / 10.0, 0.0, 8.0], (points, 3))
     # Each photo sees the points that lie ahead.
     seen = [
-        np.flatnonzero(np.abs(xyz[:, 0] - centre[0]) < 0.4 * (xyz[:, 2] - centre[2]))[:150]
-        for centre in centres
+        np.flatnonzero(np.abs(xyz[:, 0] - center[0]) < 0.4 * (xyz[:, 2] - center[2]))[:150]
+        for center in centers
     ]
     with open(folder / "sparse/0/images.bin", "wb") as file:
         file.write(struct.pack("<Q", count))
-        for number, (centre, ids) in enumerate(zip(centres, seen, strict=True)):
-            file.write(struct.pack("<I7dI", number + 1, 1.0, 0.0, 0.0, 0.0, *-centre, 1))
+        for number, (center, ids) in enumerate(zip(centers, seen, strict=True)):
+            file.write(struct.pack("<I7dI", number + 1, 1.0, 0.0, 0.0, 0.0, *-center, 1))
             file.write(f"{number:05d}.jpg".encode() + b"\0")
-            local = xyz[ids] - centre
+            local = xyz[ids] - center
             rows = np.zeros(len(ids), [("xy", "<f8", 2), ("id", "<i8")])
             rows["xy"] = 3000.0 * local[:, :2] / local[:, 2:] + [2000.0, 1500.0]
             rows["id"] = ids + 1
@@ -399,7 +390,8 @@ from pathlib import Path
 from PIL import Image
 from igsr._internal.peak_memory import peak_bytes
 from igsr.blocks.manifest import read_manifest
-from igsr.blocks.plan import blocks_for_memory, cells_of, plan_blocks
+from igsr.blocks.cells import grid_of
+from igsr.blocks.plan import blocks_for_memory, plan_blocks
 
 def never(image):
     raise RuntimeError("a photo was decoded")
@@ -410,7 +402,7 @@ began = time.process_time()
 manifest = read_manifest(Path(sys.argv[1]), 1000, 8)
 points = manifest.points()
 count = blocks_for_memory(manifest, 1000, None, available=16 << 30)
-ground, cells = cells_of(manifest, count)
+grid = grid_of([manifest.shots[index].camera for index in manifest.of_split("train")], count)
 random = np.random.default_rng(0)
 n = 20000
 low, high = points.xyz.min(axis=0), points.xyz.max(axis=0)
@@ -421,11 +413,11 @@ splats = igsr.Splats(
     np.full(n, 2.0, np.float32),
     np.zeros((n, 4, 3), np.float32),
 )
-plan = plan_blocks(manifest, ground, cells, splats, points, "cpu")
+plan = plan_blocks(manifest, grid, splats, points, "cpu")
 print(json.dumps({
     "seconds": time.process_time() - began,
     "peak": peak_bytes(),
-    "blocks": len(cells),
+    "blocks": len(grid.cells),
     "photos": plan.photos.sum(axis=0).tolist(),
     "none": int((~plan.photos.any(axis=1)).sum()),
     "test": len(manifest.of_split("test")),

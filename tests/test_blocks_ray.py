@@ -35,8 +35,8 @@ def cluster():
     cluster.shutdown()
 
 
-def standings(out):
-    """The news of each block that is being fitted."""
+def progress_of_blocks(out):
+    """The progress of each block that is being fitted."""
     found = {}
     for path in (out / "blocks").glob("block-*/progress.json"):
         try:
@@ -57,7 +57,7 @@ def test_a_node_that_is_killed_in_mid_fit_changes_no_bit(cluster, tmp_path):
         """Wait until blocks run on all three nodes, and kill one that does not run the driver."""
         deadline = time.monotonic() + 300.0
         early = SETTINGS["steps"] // 2
-        while sum(0 < one["step"] < early for one in standings(out).values()) < 3:
+        while sum(0 < one["step"] < early for one in progress_of_blocks(out).values()) < 3:
             if time.monotonic() > deadline:
                 failures.append("no three blocks were under way at one time")
                 return
@@ -77,11 +77,9 @@ def test_a_node_that_is_killed_in_mid_fit_changes_no_bit(cluster, tmp_path):
     assert len({block["process"] for block in report["blocks"]}) >= 2
 
 
-def test_every_node_tells_what_it_is(cluster, tmp_path):
+def test_all_nodes_are_checked(cluster, tmp_path):
     with RayCluster(cluster.address) as joined:
-        nodes = joined.check(tmp_path)
-        # Not what Ray lists: it notices late that a node was killed.
-        assert len(nodes) == len(cluster.list_all_nodes())
-        assert {node.igsr for node in nodes} == {igsr.__version__}
+        # Ray itself lists a killed node for a while.
+        assert len(joined.check(tmp_path)) == len(cluster.list_all_nodes())
         with pytest.raises(igsr.IgsrError, match=r"does not see .*none"):
             joined.check(tmp_path / "none")

@@ -191,7 +191,7 @@ def test_a_folder_is_complete_or_missing(tmp_path, monkeypatch):
     out = tmp_path / "out"
     out.mkdir()  # an empty one is allowed
     write_colmap(made_up(), out)
-    with pytest.raises(IgsrError, match="out holds something already"):
+    with pytest.raises(IgsrError, match="out is not empty"):
         write_colmap(made_up(), out)
     before = (out / "sparse/0/points3D.bin").read_bytes()
 

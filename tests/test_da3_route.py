@@ -13,13 +13,15 @@ from da3_networks import hashed_network
 from safetensors.torch import save_file
 from scenes import ring_camera
 
+from igsr._internal.part_usage import Usage
 from igsr.capture import Camera
 from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
 from igsr.geometry.pose_errors import pose_errors
 from igsr.geometry.similarity import Similarity, similarity_between
-from igsr.pose import FoundCameras, estimate, read_found
+from igsr.pose import CameraSettings
 from igsr.pose.alignment import AlignedPhoto
+from igsr.pose.cameras_file import KeptCameras, read_cameras_file, write_cameras_file
 from igsr.pose.da3 import prediction
 from igsr.pose.da3.backbone import BASE
 from igsr.pose.da3.checkpoint import SIZES
@@ -27,6 +29,8 @@ from igsr.pose.da3.estimator import Da3, with_shared_focals
 from igsr.pose.da3.passes import joined_passes, passes_of
 from igsr.pose.da3.prediction import Da3Predictor, memory_of_pass, resampling_of
 from igsr.pose.depth_maps import trusted_depths
+from igsr.pose.find import estimate
+from igsr.pose.found_cameras import FoundCameras
 
 SIZE = 64
 
@@ -35,11 +39,11 @@ def spheres(camera, pixels):
     """Depths [P] of a ball inside a hollow one, as a camera sees them at pixels [P, 2]."""
     K, rotation = camera.K, camera.viewmat[:3, :3]
     local = np.pad((pixels - K[[0, 1], 2]) / K[[0, 1], [0, 1]], ((0, 0), (0, 1)), constant_values=1)
-    rays, centre = local @ rotation, camera.center
-    a, b = (rays * rays).sum(1), rays @ centre
+    rays, center = local @ rotation, camera.center
+    a, b = (rays * rays).sum(1), rays @ center
 
     def hit(radius, sign):
-        inside = b * b - a * (centre @ centre - radius**2)
+        inside = b * b - a * (center @ center - radius**2)
         return np.where(inside > 0, (-b + sign * np.sqrt(np.maximum(inside, 0))) / a, np.nan)
 
     ball, shell = hit(1.0, -1), hit(9.0, 1)
@@ -96,7 +100,7 @@ def unadjusted(*arguments, **more):
 def check_cameras(found, wanted, degrees=0.01):
     errors = pose_errors(found, wanted)
     assert errors["rotation"] < degrees
-    assert errors["centre"] < 1e-3
+    assert errors["center"] < 1e-3
     for camera, truth in zip(found, wanted, strict=True):
         np.testing.assert_allclose(camera.K, truth.K, rtol=1e-6)
 
@@ -297,9 +301,8 @@ def small_photos(monkeypatch):
     return [*photos[:2], high]
 
 
-@pytest.mark.parametrize("source", ["decoder", "rays"])
-def test_the_network_on_portrait_and_landscape_photos(small_photos, source):
-    estimator = unadjusted(Da3Predictor(hashed_network(), source))
+def test_the_network_on_portrait_and_landscape_photos(small_photos):
+    estimator = unadjusted(Da3Predictor(hashed_network()))
     one, again = estimator(small_photos, seed=1), estimator(small_photos, seed=1)
     for photo, camera, depth, other in zip(
         small_photos, one.cameras, one.depths, again.cameras, strict=True
@@ -317,7 +320,7 @@ def test_a_named_checkpoint(small_photos, tmp_path, monkeypatch):
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "none"))
     monkeypatch.delenv("IGSR_DA3", raising=False)
     with pytest.raises(IgsrError, match="igsr weights fetch da3-base"):
-        estimate(small_photos, "da3")
+        estimate(small_photos, CameraSettings("da3"), print)
     network = hashed_network()
     monkeypatch.setitem(SIZES, "da3-small", network.config)
     weights = {f"model.{key}": value for key, value in network.state_dict().items()}
@@ -325,16 +328,19 @@ def test_a_named_checkpoint(small_photos, tmp_path, monkeypatch):
     (tmp_path / "config.json").write_text('{"model_name": "da3-small"}')
     monkeypatch.setattr(prediction, "MIN_FOCAL", 0.0)
     monkeypatch.setattr(prediction, "MAX_FOCAL", np.inf)
-    name, found = estimate(small_photos, "da3", checkpoint=tmp_path)
-    assert name == "da3"
+    settings = CameraSettings("da3", {"checkpoint": tmp_path})
+    found = estimate(small_photos, settings, lambda event: None)
     assert all(camera is not None for camera in found.cameras)
     content = (tmp_path / "model.safetensors").read_bytes()
     digest = hashlib.sha256(content).hexdigest()
     assert found.weights == {"name": "da3-small", "licence": "Apache-2.0", "sha256": digest}
     # The license is kept with the cameras.
-    kept = FoundCameras.of(small_photos, found, {"estimator": "da3"})
-    (tmp_path / "found.npz").write_bytes(kept.to_bytes())
-    assert read_found(tmp_path / "found.npz").estimate.weights == found.weights
+    kept = KeptCameras(
+        FoundCameras.of(small_photos, found, {"estimator": "da3"}), {}, Usage(0.0, 0.0, None)
+    )
+    write_cameras_file(tmp_path / "cameras.npz", kept)
+    again = read_cameras_file(tmp_path / "cameras.npz").found
+    assert again.estimate.weights == found.weights
 
 
 def test_predictions_that_are_not_finite(small_photos):
@@ -358,8 +364,3 @@ def test_passes_are_as_large_as_memory_allows(monkeypatch):
     ):
         predictor.most_photos(photos)
     assert memory_of_pass(BASE, 16, pixels) < 6e9
-
-
-def test_an_unknown_source_of_cameras():
-    with pytest.raises(IgsrError, match="cameras_from is 'both'; give decoder or rays"):
-        Da3Predictor(hashed_network(), "both")

@@ -71,10 +71,10 @@ def test_crops(size, image_size, expected):
 )
 def test_a_spot_is_found_at_its_place(size, image_size):
     width, height = size
-    centre = np.array([0.54 * width, 0.47 * height])
+    center = np.array([0.54 * width, 0.47 * height])
     row, column = np.indices((height, width)) + 0.5
     radius = 0.02 * min(size)
-    near = (column - centre[0]) ** 2 + (row - centre[1]) ** 2
+    near = (column - center[0]) ** 2 + (row - center[1]) ** 2
     image = np.repeat(np.rint(250 * np.exp(-near / (2 * radius**2)))[..., None], 3, axis=2)
     taken = Photo("spot.png", image.astype(np.uint8), None, None, None)
     crop = crop_of(taken, image_size)
@@ -90,7 +90,7 @@ def test_a_spot_is_found_at_its_place(size, image_size):
         found = np.array([(column * sampled).sum(), (row * sampled).sum()]) / sampled.sum()
         found = found * [grid.scale_x, grid.scale_y] + [grid.offset_x, grid.offset_y]
         # Wrong pixel centers would cost half a pixel of the network.
-        assert np.abs(found - centre).max() < 0.05 * width / crop.resized_width
+        assert np.abs(found - center).max() < 0.05 * width / crop.resized_width
 
 
 def test_transparent_and_masked_pixels():

@@ -81,7 +81,7 @@ def estimate(scene):
 def test_cameras_are_right(scene, estimate):
     errors = pose_errors(estimate.cameras, scene.cameras)
     assert errors["rotation"] < 0.01
-    assert errors["centre"] < 1e-3
+    assert errors["center"] < 1e-3
     for camera, truth in zip(estimate.cameras, scene.cameras, strict=True):
         np.testing.assert_allclose(camera.K, truth.K, rtol=1e-3)
         assert (camera.width, camera.height) == (SIZE, SIZE)

@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 import igsr
 from igsr.cli import app
+from igsr.fitting import fit_capture
 from igsr.floaters import photo_evidence, removal
 from igsr.floaters.photo_evidence import needed_by_others, sightings
 from igsr.floaters.removal import alone, stray_splats, unsupported_splats
@@ -40,14 +41,25 @@ def before(view, distance=1.2):
     return camera.center + distance * camera.viewmat[2, :3]
 
 
+def ball_and(means, **options):
+    """The ball, and specks after it."""
+    return joined([BALL, specks(means, **options)])
+
+
+def photos_of(scene=BALL, views=6, **options):
+    return scenes.capture(views=views, scene=scene, **options).views
+
+
+ABOVE = [0.0, 40.0, 0.0]  # outside of all photos
+
+
 # ---- evidence of photos ------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
 def test_sightings_count_cameras_that_see_a_splat(backend):
-    views = scenes.capture(views=4, scene=BALL).views
-    hidden = [[0.0, 40.0, 0.0]]  # above all pictures
-    model = joined([BALL, specks([before(views[0]), *hidden], size=0.02, opacity=-1.0)])
+    views = photos_of()
+    model = ball_and([before(views[0]), ABOVE], size=0.02, opacity=-1.0)
     seen = sightings(model, [view.camera for view in views], backend)
     assert seen.shown[-2:].tolist() == [1, 0]
     assert seen.before[-2:].tolist() == [1, 0]
@@ -59,21 +71,19 @@ def test_sightings_count_cameras_that_see_a_splat(backend):
 
 def test_needed_by_others_is_the_growth_of_the_squared_error(monkeypatch):
     monkeypatch.setattr(photo_evidence, "PROBES_PER_PHOTO", 2000)
-    views = scenes.capture(views=3, size=32, scene=scenes.splats(8, seed=5)).views
+    views = photos_of(scenes.splats(8, seed=5), views=3, size=32)
     model = scenes.splats(8, degree=1)
     model.opacities[:] = np.linspace(-1.0, 1.0, 8)  # below the clamp at 0.99
     estimated = needed_by_others(model, views, BLACK, backend="reference")
 
     def errors(splats):
         renders = [igsr.render(splats, v.camera, BLACK, "reference").color for v in views]
-        return np.array(
-            [np.square(c - v.image / 255.0).sum() for c, v in zip(renders, views, strict=True)]
-        )
+        pairs = zip(renders, views, strict=True)
+        return np.array([np.square(color - v.image / 255.0).sum() for color, v in pairs])
 
     for k in range(8):
-        without = subset(model, np.arange(8) != k)
-        grown = errors(without) - errors(model)
-        assert estimated[k] == pytest.approx(grown.sum() - grown.max(), rel=0.1, abs=0.3)
+        growth = errors(subset(model, np.arange(8) != k)) - errors(model)
+        assert estimated[k] == pytest.approx(growth.sum() - growth.max(), rel=0.1, abs=0.3)
 
 
 def test_masked_pixels_need_nothing():
@@ -83,16 +93,15 @@ def test_masked_pixels_need_nothing():
     assert needed_by_others(BALL, views, BLACK, backend="cpu").any()
 
 
-def with_masks_of(views, scene, splats):
+def with_masks_of(views, splats):
     """The views with masks of the pixels that these splats cover."""
-    cut = subset(scene, splats)
-    alphas = [igsr.render(cut, view.camera, backend="cpu").alpha for view in views]
+    alphas = [igsr.render(splats, view.camera, backend="cpu").alpha for view in views]
     return [replace(view, mask=alpha > 0.05) for view, alpha in zip(views, alphas, strict=True)]
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
 def test_sightings_measure_the_unmasked_area(backend):
-    views = with_masks_of(scenes.capture(views=4, scene=BALL).views, BALL, np.arange(60) < 8)
+    views = with_masks_of(photos_of(), subset(BALL, slice(8)))
     cameras, masks = [view.camera for view in views], [view.mask for view in views]
     seen = sightings(BALL, cameras, backend, masks)
     alphas = [igsr.render(BALL, camera, backend=backend).alpha for camera in cameras]
@@ -103,99 +112,75 @@ def test_sightings_measure_the_unmasked_area(backend):
     assert np.array_equal(everywhere.counted, everywhere.area)
 
 
+def unsupported(model, views, backend="cpu"):
+    """Indices of the splats that photos do not support, by kind."""
+    kinds = unsupported_splats(model, views, BLACK, backend=backend)
+    return {kind: np.flatnonzero(mask).tolist() for kind, mask in kinds.items()}
+
+
 def test_masked_splats_are_found_unless_a_photo_counts_them():
-    aside = specks([[0.0, -1.5, 0.0], [0.3, -1.5, 0.0]], size=0.08)
-    scene = joined([BALL, aside])
-    ball = np.arange(62) < 60
-    views = scenes.capture(views=6, scene=scene).views
-    masked = with_masks_of(views, scene, ball)
-    kinds = unsupported_splats(scene, masked, BLACK, backend="cpu")
-    assert np.flatnonzero(kinds["masked"]).tolist() == [60, 61]
-    assert not unsupported_splats(scene, views, BLACK, backend="cpu")["masked"].any()
-    # Splats that are masked in only half of the photos are kept.
-    some = [*masked[:3], *views[3:]]
-    assert not unsupported_splats(scene, some, BLACK, backend="cpu")["masked"].any()
+    scene = ball_and([[0.0, -1.5, 0.0], [0.3, -1.5, 0.0]], size=0.08)
+    views = photos_of(scene)
+    masked = with_masks_of(views, BALL)
+    assert unsupported(scene, masked)["masked"] == [60, 61]
+    assert unsupported(scene, views)["masked"] == []
+    assert unsupported(scene, [*masked[:3], *views[3:]])["masked"] == []
     # Pseudo-views are not evidence, since they show the fit.
-    pseudo = [replace(view, weights=np.ones((48, 48), np.float32)) for view in views]
-    kinds = unsupported_splats(scene, [*masked, *pseudo], BLACK, backend="cpu")
-    assert np.flatnonzero(kinds["masked"]).tolist() == [60, 61]
+    pseudo = [scenes.pseudo_view(view) for view in views]
+    assert unsupported(scene, [*masked, *pseudo])["masked"] == [60, 61]
 
 
 def test_tiny_masked_splats_are_left_to_pseudo_views():
-    speck = specks([[0.1, -1.4, 0.0]], size=0.004, opacity=-1.0)
-    scene = joined([BALL, speck])
-    ball = np.arange(61) < 60
-    views = scenes.capture(views=6, scene=scene).views
-    masked = with_masks_of(views, scene, ball)
-    cameras = [view.camera for view in views]
-    assert 0.0 < sightings(scene, cameras, "cpu").area[-1] < photo_evidence.MIN_AREA_PX
-    pseudo = [replace(view, weights=np.ones((48, 48), np.float32)) for view in views]
-    many = [*masked, *(pseudo * 40)]
-    kinds = unsupported_splats(scene, many, BLACK, backend="cpu")
-    assert not any(kind[-1] for kind in kinds.values())
+    scene = ball_and([[0.1, -1.4, 0.0]], size=0.004, opacity=-1.0)
+    views = photos_of(scene)
+    area = sightings(scene, [view.camera for view in views], "cpu").area[-1]
+    assert 0.0 < area < photo_evidence.MIN_AREA_PX
+    pseudo = [scenes.pseudo_view(view) for view in views]
+    found = unsupported(scene, [*with_masks_of(views, BALL), *(pseudo * 40)])
+    assert not any(60 in indices for indices in found.values())
 
 
-def test_unseen_and_floating_splats_are_found():
-    views = scenes.capture(views=6, scene=BALL).views
-    unseen, floating = [0.0, 40.0, 0.0], before(views[2])
-    model = joined([BALL, specks([unseen, floating], size=0.03, opacity=-1.0)])
-    kinds = unsupported_splats(model, views, BLACK, backend="cpu")
-    assert np.flatnonzero(kinds["unseen"]).tolist() == [60]
-    assert np.flatnonzero(kinds["floating"]).tolist() == [61]
+@pytest.mark.parametrize("backend", ["cpu", "gpu", "reference"])
+def test_unseen_and_floating_splats_are_found(backend):
+    views = photos_of()
+    model = ball_and([ABOVE, before(views[2])], size=0.03, opacity=-1.0)
+    expected = {"unseen": [60], "masked": [], "floating": [61]}
+    assert unsupported(model, views, backend) == expected
 
 
-def test_near_objects_seen_by_all_photos_are_kept():
-    """A thin veil round the ball: before it in every photo, and needed by all of them."""
+def test_near_objects_that_all_photos_show_are_kept():
+    """A thin veil around the ball: in front of it in every photo, and needed by all of them."""
     angles = np.linspace(0.0, 2.0 * np.pi, 60, endpoint=False)
     ring = [[2.4 * np.sin(a), y, -2.4 * np.cos(a)] for a in angles for y in (-0.3, 0.0, 0.3)]
-    veil = specks(ring, size=0.12, opacity=-2.0, color=0.9)
-    scene = joined([BALL, veil])
-    views = scenes.capture(views=12, scene=scene).views
+    scene = ball_and(ring, size=0.12, opacity=-2.0, color=0.9)
+    views = photos_of(scene, views=12)
     seen = sightings(scene, [view.camera for view in views], "cpu")
     assert (seen.before[60:] > 0).sum() > 60
-    found = unsupported_splats(scene, views, BLACK, backend="cpu")["floating"]
-    assert not found[seen.shown > 1].any()
+    assert not (seen.shown[unsupported(scene, views)["floating"]] > 1).any()
     # Photos without the veil do not need it, even from behind.
-    bare = scenes.capture(views=12, scene=BALL).views
-    found = unsupported_splats(scene, bare, BLACK, backend="cpu")["floating"]
-    assert found.sum() > 0
-    assert not found[:60].any()
+    floating = unsupported(scene, photos_of(views=12))["floating"]
+    assert floating
+    assert min(floating) >= 60
 
 
-def test_unsampled_photos_keep_their_splats(monkeypatch):
-    views = scenes.capture(views=6, scene=BALL, arc=0.3).views
-    speck = specks([before(views[3])], size=0.03, opacity=-1.0)
-    model = joined([BALL, speck])
-    seen = sightings(speck, [view.camera for view in views], "cpu")
-    assert seen.shown[0] > 1
-    assert unsupported_splats(model, views, BLACK, backend="cpu")["floating"][-1]
+def test_splats_of_photos_that_are_not_sampled_are_kept(monkeypatch):
+    views = photos_of(arc=0.3)
+    model = ball_and([before(views[3])], size=0.03, opacity=-1.0)
+    assert sightings(model, [view.camera for view in views], "cpu").shown[60] > 1
+    assert unsupported(model, views)["floating"] == [60]
     monkeypatch.setattr(removal, "MAX_NEED_PHOTOS", 1)
-    elsewhere = scenes.ring_camera(0.0, centre=(50.0, 0.0, 0.0))
+    elsewhere = scenes.ring_camera(0.0, center=(50.0, 0.0, 0.0))
     photos = [replace(views[0], camera=elsewhere), *views]
-    assert not unsupported_splats(model, photos, BLACK, backend="cpu")["floating"][-1]
+    assert unsupported(model, photos)["floating"] == []
 
 
 def test_pseudo_views_keep_splats_but_find_no_floaters():
-    views = scenes.capture(views=6, scene=BALL).views
-    model = joined([BALL, specks([before(views[2])], size=0.03, opacity=-1.0)])
-    pseudo = replace(views[2], weights=np.ones((48, 48), np.float32))
-    others = [view for k, view in enumerate(views) if k != 2]
-    assert unsupported_splats(model, others, BLACK, backend="cpu")["unseen"][-1]
-    kinds = unsupported_splats(model, [*others, pseudo], BLACK, backend="cpu")
-    assert not kinds["unseen"][-1]
-    assert not kinds["floating"][-1]
-
-
-def test_cpu_gpu_and_reference_find_the_same():
-    views = scenes.capture(views=4, scene=BALL).views
-    model = joined([BALL, specks([[0.0, 40.0, 0.0], before(views[2])], size=0.03, opacity=-1.0)])
-    found = {
-        name: unsupported_splats(model, views, BLACK, backend=name)
-        for name in ("cpu", "gpu", "reference")
-    }
-    for name in ("gpu", "reference"):
-        for kind, mask in found["cpu"].items():
-            assert np.array_equal(mask, found[name][kind]), (name, kind)
+    views = photos_of()
+    model = ball_and([before(views[2])], size=0.03, opacity=-1.0)
+    others = [*views[:2], *views[3:]]
+    assert unsupported(model, others)["unseen"] == [60]
+    found = unsupported(model, [*others, scenes.pseudo_view(views[2])])
+    assert found["unseen"] == found["floating"] == []
 
 
 # ---- stray splats ------------------------------------------------------------------------------
@@ -278,43 +263,21 @@ def test_a_capture_without_train_views_is_refused():
 # ---- fits --------------------------------------------------------------------------------------
 
 
-def fitted(capture, **options):
-    """Splats, and all progress, of a short fit."""
-    seen = []
-    given = {"steps": 60, "max_splats": 300, "start": "random", "backend": "cpu", **options}
-    splats = scenes.fit(capture, progress=seen.append, **given)
-    return splats, seen
-
-
-def test_fits_remove_and_count_floaters(tmp_path):
-    capture = scenes.capture(views=8, size=32, scene=BALL)
-    whole, said = fitted(capture, remove_floaters=False)
-    assert said[-1].removed == {}
-    checkpoint = tmp_path / "checkpoint.npz"
-    splats, said = fitted(capture, checkpoint=checkpoint)
-    kinds = unsupported_splats(whole, capture.train_views, BLACK, backend="cpu")
-    assert said[-1].removed == {name: int(kind.sum()) for name, kind in kinds.items()}
-    assert said[-1].removed["unseen"] > 0
-    assert said[-1].splats == len(splats) == len(whole) - sum(said[-1].removed.values())
-    # The checkpoint has them all: going on from the end leaves them out again.
-    again, resumed = fitted(capture, checkpoint=checkpoint, resume=True)
-    assert splats == again
-    assert [now.step for now in resumed] == [60]
-    assert resumed[-1].removed == said[-1].removed
-    assert math.isnan(resumed[-1].loss)
-
-
-def test_stopped_fits_keep_floaters():
-    capture = scenes.capture(views=8, size=32, scene=BALL)
-    seen = []
-
-    def stop(now):
-        seen.append(now)
-        return False
-
-    splats = scenes.fit(capture, 5000, stop, "cpu", max_splats=300, start="random")
-    assert seen[-1].removed == {}
-    assert len(splats) == seen[-1].splats
+@pytest.mark.parametrize("seed", range(3))
+def test_fits_remove_and_count_floaters(tmp_path, seed):
+    capture, path = scenes.capture(views=8, size=32, scene=BALL), tmp_path / "checkpoint.npz"
+    options = {"steps": 60, "max_splats": 300, "start": "random", "backend": "cpu", "seed": seed}
+    whole = fit_capture(capture, remove_floaters=False, checkpoint=path, **options)
+    assert whole.removed == {}
+    kinds = unsupported_splats(whole.splats, capture.train_views, BLACK, seed=seed, backend="cpu")
+    # Checkpoints keep floaters, since they are removed after the last step.
+    for result in (
+        fit_capture(capture, **options),
+        fit_capture(capture, checkpoint=path, resume=True, **options),
+    ):
+        assert result.removed == {name: int(kind.sum()) for name, kind in kinds.items()}
+        assert result.removed["unseen"] > 0
+        assert result.splats == subset(whole.splats, ~np.any(list(kinds.values()), axis=0))
 
 
 # ---- igsr clean --------------------------------------------------------------------------------
@@ -354,7 +317,7 @@ def test_clean_without_photos_removes_stray_splats(tmp_path):
     joined([plane(), specks([[1.0, 1.0, 30.0]])]).save(tmp_path / "scene.ply")
     result = command(tmp_path / "scene.ply")
     assert result.exit_code == 0, result.output
-    assert "removed 1 splats: 0 too faint to be drawn, 1 with few others near" in result.stdout
+    assert "removed 1 splats: 0 too faint to be drawn, 1 with few neighbors" in result.stdout
     assert igsr.Splats.load(tmp_path / "scene.clean.ply") == plane()
 
 

@@ -8,18 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rooms
+import scenes
 
 import igsr
+from igsr._internal.part_usage import Usage
 from igsr.capture import Capture, Points, View
 from igsr.capture.photo_folder import Photo
 from igsr.capture.types import Tracks
-from igsr.fitting.depth_agreement import with_agreeing_depths
-from igsr.fitting.depth_scales import with_scaled_depths
-from igsr.fitting.initialization import initial_splats
+from igsr.fitting.depth_checks import with_consistent_depths, with_scaled_depths
 from igsr.fitting.initialization.given_depths import given_points, have_depths
-from igsr.fitting.initialization.initial_splats import chosen_start
-from igsr.pose import FoundCameras, read_found
+from igsr.fitting.initialization.initial_splats import chosen_start, initial_splats
+from igsr.pose.cameras_file import KeptCameras, read_cameras_file, write_cameras_file
 from igsr.pose.estimate import Estimate
+from igsr.pose.found_cameras import FoundCameras
 from igsr.pose.grid import Grid
 from igsr.rendering.renders import render
 
@@ -37,10 +38,26 @@ def room(angles, held_out, width=96, height=72):
 
 
 def with_views(capture, change):
+    """The capture with ``change(index, view)`` applied to its train views."""
     views = [
         change(k, view) if view.split == "train" else view for k, view in enumerate(capture.views)
     ]
     return replace(capture, views=views)
+
+
+def with_factors(capture, factors):
+    """The capture with the depths of some views multiplied; None removes them."""
+
+    def change(k, view):
+        factor = factors.get(k, 1.0)
+        depth = None if factor is None else view.depth * np.float32(factor)
+        return replace(view, depth=depth)
+
+    return with_views(capture, change)
+
+
+def without_depths(capture):
+    return with_factors(capture, dict.fromkeys(range(len(capture.views))))
 
 
 def off_walls(xyz):
@@ -69,17 +86,14 @@ def test_a_fit_starts_from_depths(made):
     assert chosen_start(made) == "depths"
     splats, start = initial_splats(made, 0, 2000, 0)
     assert start == "depths"
-    assert len(splats) == 1000  # as many can be added later
+    assert len(splats) == 1000  # density control adds the rest
     assert off_walls(splats.means + splats.origin).max() < 1e-3
 
 
 def test_half_of_the_photos_must_have_depths(made):
-    def without(count):
-        return with_views(made, lambda k, v: v if k >= count else replace(v, depth=None))
-
-    # Of the photos 0, 2, 3 and 5, two have depths, then one.
-    assert have_depths(without(3).train_views)
-    assert not have_depths(without(4).train_views)
+    # The train photos are 0, 2, 3 and 5.
+    assert have_depths(with_factors(made, {0: None, 2: None}).train_views)
+    assert not have_depths(with_factors(made, {0: None, 2: None, 3: None}).train_views)
 
 
 def test_masked_transparent_and_uncertain_pixels_have_no_points(made):
@@ -104,35 +118,32 @@ def test_masked_transparent_and_uncertain_pixels_have_no_points(made):
 
 
 def test_points_of_a_wrong_depth_map_are_left_out(made):
-    def wrong(k, view):
-        return replace(view, depth=np.float32(0.5) * view.depth) if k == 2 else view
-
-    world, *_ = given_points(with_views(made, wrong).train_views, 4000, np.random.default_rng(0))
-    # All points of three photos; of the fourth, only those that no other photo contradicts.
+    wrong = with_factors(made, {2: 0.5})
+    world, *_ = given_points(wrong.train_views, 4000, np.random.default_rng(0))
+    # All points of three photos; of the fourth, only points that no photo contradicts.
     assert np.mean(off_walls(world) > 0.1) < 0.06
     whole, *_ = given_points(made.train_views, 4000, np.random.default_rng(0))
     assert len(whole) == 4000
 
 
-def fitted(capture, **options):
-    arguments = {"steps": 300, "backend": "cpu", "max_splats": 1500, "sh_degree": 0, **options}
-    return scenes.fit(capture, **arguments)
+OPTIONS = {"steps": 300, "backend": "cpu", "max_splats": 1500, "sh_degree": 0}
 
 
-def score(splats, capture):
-    return igsr.evaluate(splats, capture, backend="cpu")["psnr"]
+def fit(capture, **options):
+    return scenes.fit(capture, **{**OPTIONS, **options})
+
+
+def psnr(splats, capture):
+    return igsr.evaluate(splats, capture, backend="cpu").psnr
 
 
 def test_depths_improve_held_out_photos_even_if_one_is_wrong():
     # Too far apart for features and patches.
     capture = room(np.linspace(-1.2, 1.2, 5), (1, 3))
-    bare = with_views(capture, lambda k, v: replace(v, depth=None))
-    wrong = with_views(
-        capture, lambda k, v: replace(v, depth=np.float32(1.5) * v.depth) if k == 0 else v
-    )
-    without, given, one_wrong = (score(fitted(c), capture) for c in (bare, capture, wrong))
-    assert given > without + 1.0, (without, given)
-    assert one_wrong > without + 0.5, (without, one_wrong)
+    captures = without_depths(capture), capture, with_factors(capture, {0: 1.5})
+    without, given, one_wrong = (psnr(fit(photos), capture) for photos in captures)
+    assert given > without + 1.0
+    assert one_wrong > without + 0.5
 
 
 def test_the_depth_loss_brings_renders_closer_to_depths(made):
@@ -140,82 +151,48 @@ def test_the_depth_loss_brings_renders_closer_to_depths(made):
         errors = []
         for view in made.train_views:
             drawn = render(splats, view.camera, (0.0, 0.0, 0.0), backend="cpu")
-            there = drawn.alpha > 0.9
-            errors.append(np.abs(drawn.expected_depth / view.depth - 1.0)[there].mean())
+            opaque = drawn.alpha > 0.9
+            errors.append(np.abs(drawn.expected_depth / view.depth - 1.0)[opaque].mean())
         return np.mean(errors)
 
     start, _ = initial_splats(made, 0, 1500, 0, "rays")
-    loose, near = (error(fitted(made, start=start, depth_weight=w)) for w in (0.0, 1.0))
-    assert near < 0.7 * loose, (near, loose)
+    loose, near = (error(fit(made, start=start, depth_weight=weight)) for weight in (0.0, 1.0))
+    assert near < 0.7 * loose
 
 
 def test_a_weight_of_0_uses_no_depths(made):
-    bare = with_views(made, lambda k, v: replace(v, depth=None))
     options = {"steps": 40, "depth_weight": 0.0}
-    first, second = fitted(made, **options), fitted(bare, **options)
-    assert np.array_equal(first.means, second.means)
-    assert np.array_equal(first.sh, second.sh)
+    assert fit(made, **options) == fit(without_depths(made), **options)
 
 
 def test_cpu_and_gpu_fit_alike(made):
-    cpu, gpu = (score(fitted(made, steps=60, backend=name), made) for name in ("cpu", "gpu"))
+    cpu, gpu = (psnr(fit(made, steps=60, backend=name), made) for name in ("cpu", "gpu"))
     assert cpu == pytest.approx(gpu, abs=0.1)
-
-
-def test_a_resumed_fit_ends_with_the_same_bits(made, tmp_path):
-    whole = fitted(made, steps=60)
-    file = tmp_path / "checkpoint.npz"
-    fitted(made, steps=60, checkpoint=file, progress=lambda now: now.step < 20)
-    again = fitted(made, steps=60, checkpoint=file, resume=True)
-    assert np.array_equal(whole.means, again.means)
-    assert np.array_equal(whole.sh, again.sh)
-    fitted(made, steps=60, checkpoint=file, progress=lambda now: now.step < 20)
-    other = with_views(made, lambda k, v: replace(v, depth=v.depth + np.float32(0.01 * (k == 2))))
-    with pytest.raises(igsr.IgsrError, match="other photos"):
-        fitted(other, steps=60, checkpoint=file, resume=True)
-
-
-def test_baseline_presets_use_no_depths():
-    for preset in ("3dgs", "instantsplat"):
-        assert igsr.fitting.presets.settings_for(preset, 4).depth_weight == 0.0
-
-
-@pytest.mark.parametrize("weight", [-1.0, float("nan"), float("inf"), 1e9, "much"])
-def test_an_invalid_weight_is_named(made, weight):
-    with pytest.raises(igsr.IgsrError, match="depth_weight"):
-        fitted(made, depth_weight=weight)
 
 
 # ---- depths in the unit of the cameras -----------------------------------------------------------
 
 
 def points_of(capture, per_photo=60):
-    """Points on the walls with tracks, as a structure-from-motion program has them."""
+    """Points on the walls, each seen by one photo with depths."""
     random = np.random.default_rng(4)
-    xyz, view, xy = [], [], []
-    for k, one in enumerate(capture.views):
-        if one.depth is None:
-            continue
-        place = random.uniform(
-            [2.0, 2.0], [one.camera.width - 2, one.camera.height - 2], (per_photo, 2)
-        )
-        column, row = np.floor(place).astype(int).T
-        local = np.concatenate([place, np.ones((per_photo, 1))], 1) @ np.linalg.inv(one.camera.K).T
-        local *= rooms.depth(one.camera)[row, column, None]
-        xyz.append((local - one.camera.viewmat[:3, 3]) @ one.camera.viewmat[:3, :3])
-        view += [k] * per_photo
-        xy.append(place)
-    count = len(view)
-    tracks = Tracks(
-        [one.name for one in capture.views], np.array(view), np.arange(count), np.concatenate(xy)
-    )
-    return Points(np.concatenate(xyz), np.full((count, 3), 128, np.uint8), None, tracks)
+    numbers = [k for k, view in enumerate(capture.views) if view.depth is not None]
+    xyz, xy = [], []
+    for camera in (capture.views[k].camera for k in numbers):
+        pixels = random.uniform(2.0, [camera.width - 2, camera.height - 2], (per_photo, 2))
+        rays = np.pad(pixels, ((0, 0), (0, 1)), constant_values=1.0) @ np.linalg.inv(camera.K).T
+        local = rays * rooms.depths(camera, pixels)[:, None]
+        xyz.append((local - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3])
+        xy.append(pixels)
+    names = [view.name for view in capture.views]
+    seen_by = np.repeat(numbers, per_photo)
+    tracks = Tracks(names, seen_by, np.arange(len(seen_by)), np.concatenate(xy))
+    return Points(np.concatenate(xyz), np.full((len(seen_by), 3), 128, np.uint8), None, tracks)
 
 
 def test_depths_of_each_photo_are_scaled_to_the_points(made):
     points = points_of(made)
-    factors = [0.001, 1.0, 250.0, 0.2, 0.5, 3.0]
-    scaled = with_views(made, lambda k, v: replace(v, depth=v.depth * np.float32(factors[k])))
+    scaled = with_factors(made, {0: 0.001, 2: 250.0, 3: 0.2, 5: 3.0})
     for view, truth in zip(with_scaled_depths(scaled.views, points), made.views, strict=True):
         if truth.depth is None:
             assert view.depth is None
@@ -232,55 +209,46 @@ def test_depths_of_something_else_are_left_out(made):
     spoiled = with_views(
         made, lambda k, v: replace(v, depth=noise.astype(np.float32)) if k == 2 else v
     )
-    with pytest.warns(UserWarning, match=r"The depth of 2\.png does not fit to the points"):
+    with pytest.warns(UserWarning, match=r"The depth of 2\.png does not fit the points"):
         views = with_scaled_depths(spoiled.views, points_of(made))
     assert [view.depth is None for view in views] == [False, True, True, False, True, False]
 
 
 def test_a_fit_scales_depths(made):
     points = points_of(made)
-    scaled = with_views(made, lambda k, v: replace(v, depth=v.depth * np.float32(0.1)))
-    splats = fitted(replace(scaled, points=points), steps=30)
+    scaled = with_factors(made, dict.fromkeys(range(6), 0.1))
+    splats = fit(replace(scaled, points=points), steps=30)
     assert np.median(off_walls(splats.means + splats.origin)) < 0.1
 
 
 def depths_left_out(capture):
     """Numbers of the train photos without depth."""
-    views = with_agreeing_depths(capture.views)
+    views = with_consistent_depths(capture.views)
     return [k for k, view in enumerate(views) if view.split == "train" and view.depth is None]
-
-
-def times(capture, factors):
-    """The capture with some photos' depths multiplied."""
-    return with_views(
-        capture,
-        lambda k, v: replace(v, depth=v.depth * np.float32(factors[k])) if k in factors else v,
-    )
 
 
 @pytest.mark.parametrize("factor", [0.6, 1.3, 2.0])
 def test_depths_that_other_photos_contradict_are_not_used(made, factor):
     with pytest.warns(UserWarning, match=r"The depth of 2\.png contradicts that of the other"):
-        assert depths_left_out(times(made, {2: factor})) == [2]
+        assert depths_left_out(with_factors(made, {2: factor})) == [2]
 
 
 def test_depths_without_a_majority_against_them_are_kept(made):
     assert depths_left_out(made) == []
     # Two photos that disagree: either may be right.
-    two = with_views(made, lambda k, v: v if k in (0, 2) else replace(v, depth=None))
-    assert depths_left_out(times(two, {2: 2.0})) == depths_left_out(two)
-    # A common factor is no contradiction.
-    assert depths_left_out(times(made, dict.fromkeys(range(6), 1.5))) == []
+    assert depths_left_out(with_factors(made, {2: 2.0, 3: None, 5: None})) == [3, 5]
+    # A common factor contradicts nothing.
+    assert depths_left_out(with_factors(made, dict.fromkeys(range(6), 1.5))) == []
     # Photos without depths, and none at all.
-    none = with_views(made, lambda k, v: replace(v, depth=None))
-    assert all(a is b for a, b in zip(with_agreeing_depths(none.views), none.views, strict=True))
-    assert with_agreeing_depths([]) == []
+    none = without_depths(made)
+    assert all(a is b for a, b in zip(with_consistent_depths(none.views), none.views, strict=True))
+    assert with_consistent_depths([]) == []
 
 
 def test_hidden_surfaces_are_no_contradiction():
-    # Photos of both sides of a wall: each sees the other's points behind its own surface.
+    # Photos of both sides of a wall: each sees the points of the far side behind its surface.
     behind = np.diag([-1.0, 1.0, -1.0, 1.0])
-    behind[2, 3] = 6.0  # the other camera stands 6 units away and looks back
+    behind[2, 3] = 6.0  # 6 units away, looking back
     views = []
     for k, viewmat in enumerate([np.eye(4), np.eye(4), behind, behind]):
         moved = viewmat.copy()
@@ -289,16 +257,22 @@ def test_hidden_surfaces_are_no_contradiction():
         image = np.zeros((30, 40, 3), np.uint8)
         # Walls at z = 2 and z = 4 of the first camera.
         views.append(View(f"{k}.png", camera, "train", image, depth=np.full((30, 40), 2.0, "f4")))
-    assert all(a is b for a, b in zip(with_agreeing_depths(views), views, strict=True))
+    assert all(a is b for a, b in zip(with_consistent_depths(views), views, strict=True))
 
 
 def test_a_fit_leaves_out_a_photos_wrong_depths(made):
     with pytest.warns(UserWarning, match="contradicts"):
-        splats = fitted(times(made, {2: 1.6}), steps=30)
+        splats = fit(with_factors(made, {2: 1.6}), steps=30)
     assert np.median(off_walls(splats.means + splats.origin)) < 0.1
 
 
 # ---- depths of networks --------------------------------------------------------------------------
+
+
+def written_and_read(found, folder):
+    """Found cameras from a cameras file."""
+    write_cameras_file(folder / "cameras.npz", KeptCameras(found, {}, Usage(0.0, 0.0, None)))
+    return read_cameras_file(folder / "cameras.npz").found
 
 
 def test_trusted_depths_of_an_estimator_are_kept_with_the_photos(made, tmp_path):
@@ -313,9 +287,8 @@ def test_trusted_depths_of_an_estimator_are_kept_with_the_photos(made, tmp_path)
     cameras, grids = [view.camera for view in made.views], [*[grid] * 5, None]
     estimate = Estimate(cameras, None, [*depths[:5], None], [*sure[:5], None], [], grids=grids)
     found = FoundCameras.of(photos, estimate, {"estimator": "stand-in"})
-    (tmp_path / "found.npz").write_bytes(found.to_bytes())
-    for one in (found, read_found(tmp_path / "found.npz")):
-        capture = one.capture(Path("room"), photos)
+    for cameras_of_room in (found, written_and_read(found, tmp_path)):
+        capture = cameras_of_room.capture(Path("room"), photos)
         assert [k for k in range(6) if capture.views[k].depth is None] == [1, 5]
         for k in (0, 2, 3, 4):
             depth, truth = capture.views[k].depth, rooms.depth(made.views[k].camera)
@@ -337,6 +310,5 @@ def test_damaged_kept_depths_are_refused(made, tmp_path):
         estimate = Estimate(cameras, None, list(nothing), nothing, [])
         found = FoundCameras.of(photos, estimate, {})
         found.estimate.depths[0] = bad
-        (tmp_path / "found.npz").write_bytes(found.to_bytes())
-        with pytest.raises(igsr.IgsrError, match=r"delete .* to find the cameras anew"):
-            read_found(tmp_path / "found.npz")
+        with pytest.raises(igsr.IgsrError, match="delete it to find the cameras again"):
+            written_and_read(found, tmp_path)

@@ -173,7 +173,7 @@ def test_the_convert_command_writes_levels(tmp_path):
     assert (tmp_path / "out/lod-meta.json").is_file()
     again = run(str(tmp_path / "out"), "--lod", "2")
     assert again.returncode != 0
-    assert "holds something already" in " ".join(again.stderr.split())
+    assert "is not empty" in " ".join(again.stderr.split())
     for wrong in ("9", "0", "-1"):
         refused = run(str(tmp_path / "other"), "--lod", wrong)
         assert "from 1 to 8" in " ".join(refused.stderr.split())

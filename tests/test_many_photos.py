@@ -60,6 +60,6 @@ def test_a_refinement_ends_where_photos_leave_nothing_open(ball_photos, monkeypa
 
 @pytest.mark.parametrize("count", [1, 9])
 def test_the_default_end_is_for_more_photos_than_a_ring_has(ball_photos, count):
-    from igsr.fitting.photo_support import support_of
+    from igsr.fitting.photo_statistics import photo_statistics
 
-    assert support_of(ball_photos.train_views[:count]).seen_by < loop.ENOUGH_PHOTOS
+    assert photo_statistics(ball_photos.train_views[:count]).seen_by < loop.ENOUGH_PHOTOS

@@ -95,6 +95,6 @@ def test_no_view_stands_inside_or_behind_a_wall():
 
 
 def test_where_nothing_is_seen_there_is_nowhere_to_look():
-    away = scenes.ring_camera(0.0, centre=(50.0, 0.0, 0.0))
+    away = scenes.ring_camera(0.0, center=(50.0, 0.0, 0.0))
     assert novel_views(BALL, [away], 5, "cpu") == []
     assert novel_views(BALL, [], 5, "cpu") == []

@@ -1,4 +1,4 @@
-"""Seconds, processor seconds and peak memory of parts."""
+"""Seconds and memory of the parts of a run."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ MIB = 2**20
 
 
 @pytest.mark.skipif(
-    not os.access(peak_memory.CLEAR_REFS, os.W_OK), reason="only Linux forgets a peak"
+    not os.access(peak_memory.CLEAR_REFS, os.W_OK), reason="only Linux resets the peak"
 )
 def test_each_part_has_a_peak_of_its_own():
-    # A process of its own: what other tests left in memory may be freed in between.
+    # In a new process, since other tests may free memory in between.
     code = """
 import numpy as np
 from igsr._internal.part_usage import Parts, total
@@ -39,7 +39,7 @@ print(total(parts.plain()).peak_memory_bytes)
     assert whole == large
 
 
-def test_sleep_takes_seconds_and_work_takes_processor_seconds():
+def test_work_takes_processor_seconds_and_sleep_does_not():
     meter = Meter()
     time.sleep(0.2)
     slept = meter.lap()
@@ -52,7 +52,7 @@ def test_sleep_takes_seconds_and_work_takes_processor_seconds():
     assert worked.cpu_seconds >= 0.15
 
 
-def test_a_part_that_is_named_again_is_added_up():
+def test_parts_of_one_name_are_added_up():
     parts = Parts()
     parts.add("fit", Usage(1.0, 2.0, 100))
     parts.add("score", Usage(0.5, 0.5, 300))
@@ -62,14 +62,14 @@ def test_a_part_that_is_named_again_is_added_up():
     assert list(parts.plain()) == ["fit", "score"]
 
 
-def test_it_is_counted_where_a_part_fails():
+def test_a_part_that_fails_is_measured():
     parts = Parts()
     with pytest.raises(ValueError, match="no"), parts.measured("fit"):
         raise ValueError("no")
     assert parts.used["fit"].seconds >= 0.0
 
 
-def test_a_system_that_does_not_say_has_none(monkeypatch, tmp_path):
+def test_systems_without_a_peak_per_part(monkeypatch, tmp_path):
     monkeypatch.setattr(peak_memory, "STATUS", tmp_path / "none")
     monkeypatch.setattr(peak_memory, "CLEAR_REFS", tmp_path / "none" / "none")
     assert not peak_memory.forget_peak()
@@ -77,8 +77,13 @@ def test_a_system_that_does_not_say_has_none(monkeypatch, tmp_path):
     assert Usage(1.0, 1.0, None) + Usage(1.0, 1.0, None) == Usage(2.0, 2.0, None)
 
 
+def test_usages_are_read_as_they_were_written():
+    usage = Usage(1.25, 2.5, 7)
+    assert Usage.of(usage.plain()) == usage
+
+
 @pytest.mark.parametrize(
-    "found",
+    "damaged",
     [
         {},
         [],
@@ -88,11 +93,6 @@ def test_a_system_that_does_not_say_has_none(monkeypatch, tmp_path):
         {"seconds": 1, "cpu_seconds": "a", "peak_memory_bytes": 1},
     ],
 )
-def test_what_is_no_usage_is_refused(found):
+def test_damaged_usages_are_refused(damaged):
     with pytest.raises((KeyError, TypeError, ValueError, OverflowError)):
-        Usage.of(found)
-
-
-def test_a_usage_is_read_as_it_was_written():
-    usage = Usage(1.25, 2.5, 7)
-    assert Usage.of(usage.plain()) == usage
+        Usage.of(damaged)

@@ -1,4 +1,4 @@
-"""Points of a start without points: on the surface where photos tell, anywhere else last."""
+"""Points by plane sweep are on the visible surface."""
 
 from __future__ import annotations
 
@@ -9,11 +9,10 @@ import pytest
 import scenes
 
 from igsr.capture import Camera, View
-from igsr.fitting.initialization import plane_sweep
 from igsr.fitting.initialization.plane_sweep import (
-    FARTHEST,
-    MOST_SWEPT,
-    _depth_range,
+    MAX_DEPTH,
+    MAX_DEPTH_MAPS,
+    MIN_DEPTH,
     can_sweep,
     depth_maps,
     swept_points,
@@ -21,112 +20,122 @@ from igsr.fitting.initialization.plane_sweep import (
 
 SIZE, FOCAL, DEPTH = 64, 80.0, 4.0
 #: The wall moves by 8 pixels from photo to photo, and photos are compared at whole pixels.
-NEAR = 0.3
-TARGET = np.array([0.0, 0.0, DEPTH])
+TOLERANCE = 0.3
 
 
-def views(count=3, flat=lambda x: np.zeros(x.shape, dtype=bool), baseline=0.4):
-    """Photos of a wall at z = 4 with a random texture, but for a grey part."""
-    texture = np.random.default_rng(0).integers(0, 256, (40, 200, 3))
-    made = []
+def wall(count=3, is_plain=lambda x: np.zeros(x.shape, dtype=bool), baseline=0.4, seed=0):
+    """Photos side by side of a wall at z = 4 with a random texture, with gray parts."""
+    texture = np.random.default_rng(seed).integers(0, 256, (40, 200, 3))
+    views = []
     for i in range(count):
-        centre = baseline * (i - (count - 1) / 2)
+        center = baseline * (i - (count - 1) / 2)
         viewmat = np.eye(4)
-        viewmat[0, 3] = -centre
+        viewmat[0, 3] = -center
         K = np.array([[FOCAL, 0, SIZE / 2], [0, FOCAL, SIZE / 2], [0, 0, 1]])
-        at = (np.arange(SIZE) + 0.5 - SIZE / 2) / FOCAL * DEPTH
-        y, x = np.meshgrid(at, at + centre, indexing="ij")
-        cells = texture[((y + 2.0) * 10).astype(int) % 40, ((x + 10.0) * 10).astype(int) % 200]
-        image = np.where(flat(x)[..., None], 128, cells).astype(np.uint8)
-        made.append(View(f"{i}.png", Camera(viewmat, K, SIZE, SIZE), "train", image))
-    return made
+        offset = (np.arange(SIZE) + 0.5 - SIZE / 2) / FOCAL * DEPTH
+        y, x = np.meshgrid(offset, offset + center, indexing="ij")
+        colors = texture[((y + 2.0) * 10).astype(int) % 40, ((x + 10.0) * 10).astype(int) % 200]
+        image = np.where(is_plain(x)[..., None], 128, colors).astype(np.uint8)
+        views.append(View(f"{i}.png", Camera(viewmat, K, SIZE, SIZE), "train", image))
+    return views
 
 
-#: The photos' axes are parallel: what they look at is known from points.
-KNOWN = np.random.default_rng(0).uniform(-1.0, 1.0, (50, 3)) + TARGET
+#: The photos' axes are parallel, so their focus point is unknown without points.
+KNOWN = np.random.default_rng(0).uniform(-1.0, 1.0, (50, 3)) + np.array([0.0, 0.0, DEPTH])
 
 
-def points(photos, count=400, seed=0):
-    return swept_points(photos, KNOWN, count, np.random.default_rng(seed))
+def points(views, count=400, seed=0):
+    return swept_points(views, KNOWN, count, np.random.default_rng(seed))
 
 
-def test_points_lie_on_the_surface_with_its_colours():
-    photos = views()
-    xyz, colors = points(photos)
+def fraction_on_wall(xyz):
+    return np.mean(np.abs(xyz[:, 2] - DEPTH) < TOLERANCE)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_points_are_on_the_surface_with_its_colors(seed):
+    views = wall(seed=seed)
+    xyz, colors = points(views)
     assert xyz.shape == colors.shape == (400, 3)
-    assert np.mean(np.abs(xyz[:, 2] - DEPTH) < NEAR) > 0.95
-    again, _ = points(photos)
-    np.testing.assert_array_equal(xyz, again)
-    pixel = np.floor(FOCAL * xyz[:, :2] / xyz[:, 2:] + SIZE / 2).astype(int).clip(0, SIZE - 1)
-    seen = photos[1].image[pixel[:, 1], pixel[:, 0]] / 255.0
+    assert fraction_on_wall(xyz) > 0.95
+    np.testing.assert_array_equal(xyz, points(views)[0])
+    column, row = np.floor(FOCAL * xyz[:, :2] / xyz[:, 2:] + SIZE / 2).astype(int).T
+    seen = views[1].image[row.clip(0, SIZE - 1), column.clip(0, SIZE - 1)] / 255.0
     assert np.abs(seen - colors).mean() < 0.15
 
 
-def test_points_avoid_what_photos_cannot_tell():
-    xyz, _ = points(views(flat=lambda x: x < 0.0))
+def test_plain_surfaces_have_few_points():
+    xyz, _ = points(wall(is_plain=lambda x: x < 0.0))
     assert np.mean(xyz[:, 0] < -0.3) < 0.1
 
 
 def test_masked_pixels_have_no_points_and_do_not_matter():
     def masked(seed):
-        photos = views()
-        noise = np.random.default_rng(seed)
-        for view in photos:
+        views = wall()
+        random = np.random.default_rng(seed)
+        for view in views:
             view.mask = np.zeros((SIZE, SIZE), dtype=bool)
             view.mask[:32] = True
-            view.image[32:] = noise.integers(0, 256, (SIZE - 32, SIZE, 3))
-        return points(photos)[0]
+            view.image[32:] = random.integers(0, 256, (SIZE - 32, SIZE, 3))
+        return points(views)[0]
 
     xyz = masked(0)
-    assert np.mean(np.abs(xyz[:, 2] - DEPTH) < NEAR) > 0.95
+    assert fraction_on_wall(xyz) > 0.95
     assert xyz[:, 1].max() <= 1e-9
     np.testing.assert_array_equal(xyz, masked(1))
 
 
-def test_photos_are_swept_that_have_a_near_neighbour():
-    ring = [replace(views(1)[0], camera=scenes.ring_camera(a, SIZE)) for a in (0.0, 0.6, 1.2, 2.4)]
-    centre = np.zeros(3)
-    assert can_sweep(ring[:3], centre)
-    assert not can_sweep(ring, centre)
-    assert not can_sweep(ring[:1], centre)
-    assert not can_sweep(ring[:3], centre, 30.0)
+def test_photos_are_swept_if_another_is_near():
+    angles = (0.0, 0.6, 1.2, 2.4)
+    ring = [replace(wall(1)[0], camera=scenes.ring_camera(angle, SIZE)) for angle in angles]
+    target = np.zeros(3)
+    assert can_sweep(ring[:3], target)
+    assert not can_sweep(ring, target)
+    assert not can_sweep(ring[:1], target)
+    assert not can_sweep(ring[:3], target, 30.0)
 
 
 def back_to_back():
-    photos = views(2)
-    turned = replace(photos[1].camera, viewmat=np.diag([-1.0, 1.0, -1.0, 1.0]))
-    return [photos[0], replace(photos[1], camera=turned)]
+    first, second = wall(2)
+    camera = replace(second.camera, viewmat=np.diag([-1.0, 1.0, -1.0, 1.0]))
+    return [first, replace(second, camera=camera)]
 
 
-@pytest.mark.parametrize("photos", [views(1), back_to_back()])
-def test_photos_that_tell_nothing_give_no_points(photos):
-    xyz, colors = points(photos)
+@pytest.mark.parametrize("views", [wall(1), back_to_back()])
+def test_photos_without_a_neighbor_give_no_points(views):
+    xyz, colors = points(views)
     assert xyz.shape == colors.shape == (0, 3)
 
 
-def test_known_points_tell_the_range_of_depths():
-    photo = views()[0]
-    nearest, farthest = _depth_range(photo, TARGET, KNOWN)
-    assert nearest < DEPTH - 1.0 < DEPTH + 1.0 < farthest
-    assert farthest / nearest < 0.5 * FARTHEST / plane_sweep.NEAREST
-    without = plane_sweep.NEAREST * DEPTH, FARTHEST * DEPTH
-    assert _depth_range(photo, np.array([photo.camera.center[0], 0, DEPTH]), None) == without
-    assert _depth_range(photo, np.array([photo.camera.center[0], 0, DEPTH]), KNOWN[:5]) == without
-
-
-def test_points_need_a_second_depth_map_that_agrees():
-    """Of a photo whose neighbour shows another scene, little is believed: what agrees by chance."""
-    photos = views()
+def test_known_points_narrow_the_range_of_depths():
+    known = KNOWN - np.array([0.0, 0.0, DEPTH])
     noise = np.random.default_rng(5).integers(0, 256, (SIZE, SIZE, 3)).astype(np.uint8)
-    strange = [photos[0], replace(photos[1], image=noise)]
+    cameras = [scenes.ring_camera(angle, SIZE, DEPTH) for angle in (0.0, 0.2, 0.4)]
+    views = [replace(wall(1)[0], camera=camera, image=noise) for camera in cameras]
+
+    def depth_range(known):
+        depth = 1.0 / depth_maps(views, known)[1].inverse_depth
+        return depth.min(), depth.max()
+
+    nearest, farthest = depth_range(known)
+    assert nearest < DEPTH - 1.0 < DEPTH + 1.0 < farthest
+    assert farthest / nearest < 0.5 * MAX_DEPTH / MIN_DEPTH
+    # Too few points do not count.
+    assert depth_range(known[:5]) == depth_range(None)
+    assert depth_range(None) == pytest.approx((MIN_DEPTH * DEPTH, MAX_DEPTH * DEPTH), rel=0.05)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_points_need_a_second_depth_map_that_agrees(seed):
+    views = wall()
+    noise = np.random.default_rng(seed).integers(0, 256, (SIZE, SIZE, 3)).astype(np.uint8)
+    strange = [views[0], replace(views[1], image=noise)]
     assert len(points(strange)[0]) < 0.05 * SIZE * SIZE
-    assert len(points(photos[:2], count=SIZE * SIZE)[0]) > 0.3 * SIZE * SIZE
+    assert len(points(views[:2], count=SIZE * SIZE)[0]) > 0.3 * SIZE * SIZE
 
 
 def test_of_many_photos_some_are_swept():
-    photos = views(MOST_SWEPT + 6, baseline=0.05)
-    maps = depth_maps(photos, KNOWN)
-    assert len(maps) == MOST_SWEPT
-    names = [one.view.name for one in maps]
-    assert names[0] == photos[0].name
-    assert names[-1] == photos[-1].name
+    views = wall(MAX_DEPTH_MAPS + 6, baseline=0.05)
+    names = [depth_map.view.name for depth_map in depth_maps(views, KNOWN)]
+    assert len(names) == MAX_DEPTH_MAPS
+    assert (names[0], names[-1]) == (views[0].name, views[-1].name)

@@ -1,4 +1,4 @@
-"""What tracks say about cameras, and joint fits that it is a prior for."""
+"""Pose priors from tracks, and joint fits that they hold."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from made_up_tracks import projected, tracked
 
 import igsr
 from igsr.capture import Capture, View
-from igsr.fitting.pose_priors import LEAST_ERROR, LEFT_OPEN, pose_priors
+from igsr.fitting.pose_priors import DEVIATION_FACTOR, MIN_ERROR_PX, pose_priors
 from igsr.geometry.pose_errors import pose_errors
 
 COUNT = 4
 XYZ = np.random.default_rng(1).normal(scale=0.4, size=(30, 3))
 BLANK = np.zeros((64, 64, 3), np.uint8)
-#: Some are off their axis, so that no two parameters do the same by chance.
+#: Uneven angles, so that no two parameters have the same effect by chance.
 VIEWS = [
     View(f"{k}.png", scenes.ring_camera(0.5 * k + 0.03 * k**2, 64), "train", BLANK)
     for k in range(COUNT)
@@ -30,7 +30,7 @@ def cross(v):
 
 
 def moved(view, turn, move, log_focal=0.0):
-    """The view with its camera turned about and moved along its own axes, as fits do."""
+    """The view with its camera rotated about and moved along its own axes, as fits do."""
     angle = np.linalg.norm(turn)
     axis = cross(turn) / max(angle, 1e-300)
     rotation = np.eye(3) + np.sin(angle) * axis + (1.0 - np.cos(angle)) * axis @ axis
@@ -42,51 +42,37 @@ def moved(view, turn, move, log_focal=0.0):
     return replace(view, camera=replace(view.camera, viewmat=viewmat, K=K))
 
 
-def by_hand(views, points, poses, focal):
-    """Covariance [N, N] of all camera parameters, by differences and pseudo-inverses of all."""
+def expected_covariance(views, points, poses, focal):
+    """Covariance [N, N] of all camera parameters, by finite differences and pseudo-inverses."""
     tracks, count = points.tracks, len(views)
     focals = {"fixed": 0, "shared": 1, "per-camera": count}[focal]
+    size = 6 * count * poses + focals
 
-    def errors(cameras, shifts):
-        changed = [
-            moved(
-                view,
-                *(cameras[: 6 * count].reshape(count, 2, 3)[k] if poses else np.zeros((2, 3))),
-                0.0 if not focals else cameras[len(cameras) - focals :][k if focals > 1 else 0],
-            )
-            for k, view in enumerate(views)
-        ]
+    def errors(parameters):
+        cameras, shifts = parameters[:size], parameters[size:]
+        moves = cameras[: 6 * count * poses].reshape(-1, 2, 3) if poses else np.zeros((count, 2, 3))
+        logs = np.resize(cameras[size - focals :], count) if focals else np.zeros(count)
+        changed = [moved(view, *moves[k], logs[k]) for k, view in enumerate(views)]
         xyz = points.xyz + shifts.reshape(-1, 3)
         seen = np.stack([projected(view.camera, xyz) for view in changed])
         return (seen[tracks.view, tracks.point] - tracks.xy).ravel()
 
-    size = 6 * count * poses + focals
-    zeros = np.zeros(size), np.zeros(points.xyz.size)
-    steps = [(1e-5 * np.eye(size), 0), (1e-5 * np.eye(points.xyz.size), 1)]
-    of_camera, of_point = (
-        np.stack(
-            [
-                (
-                    errors(*(s if i == which else zeros[i] for i in range(2)))
-                    - errors(*(-s if i == which else zeros[i] for i in range(2)))
-                )
-                / 2e-5
-                for s in each
-            ],
-            axis=1,
-        )
-        for each, which in steps
-    )
-    error = errors(*zeros)
-    rest = np.eye(len(error)) - of_point @ np.linalg.pinv(of_point, rcond=1e-9)
-    normal = of_camera.T @ rest @ of_camera
-    scale = np.sqrt(np.diagonal(of_camera.T @ rest @ of_camera))
-    inverse = np.linalg.pinv(normal / np.outer(scale, scale), rcond=1e-8) / np.outer(scale, scale)
-    step = -inverse @ of_camera.T @ rest @ error
-    left = np.sum((rest @ (error + of_camera @ step)) ** 2)
-    freedom = len(error) - len(zeros[1]) - size
-    variance = LEFT_OPEN**2 * max(left / freedom, LEAST_ERROR**2)
-    return inverse * variance + np.outer(step, step)
+    step = 1e-5
+    columns = [
+        (errors(change) - errors(-change)) / (2.0 * step)
+        for change in step * np.eye(size + points.xyz.size)
+    ]
+    by_camera, by_point = np.stack(columns[:size], axis=1), np.stack(columns[size:], axis=1)
+    error = errors(np.zeros(len(columns)))
+    rest = np.eye(len(error)) - by_point @ np.linalg.pinv(by_point, rcond=1e-9)
+    normal = by_camera.T @ rest @ by_camera
+    unit = np.sqrt(np.diagonal(normal))
+    scale = np.outer(unit, unit)
+    inverse = np.linalg.pinv(normal / scale, rcond=1e-8) / scale
+    move = -inverse @ by_camera.T @ rest @ error
+    left = np.sum((rest @ (error + by_camera @ move)) ** 2)
+    variance = DEVIATION_FACTOR**2 * max(left / (len(error) - len(columns)), MIN_ERROR_PX**2)
+    return inverse * variance + np.outer(move, move)
 
 
 @pytest.mark.parametrize(
@@ -99,11 +85,11 @@ def by_hand(views, points, poses, focal):
         (False, "per-camera"),
     ],
 )
-def test_it_is_what_bundle_adjustment_reports(poses, focal):
+def test_priors_are_those_of_bundle_adjustment(poses, focal):
     points = tracked(VIEWS, XYZ, noise=0.7, miss=0.3)
     given = [moved(view, 1e-3 * np.ones(3), 1e-3 * np.ones(3)) for view in VIEWS[:1]] + VIEWS[1:]
     found = pose_priors(given, points, poses=poses, focal=focal)
-    expected = by_hand(given, points, poses, focal)
+    expected = expected_covariance(given, points, poses, focal)
     for k in range(COUNT):
         if poses:
             rows = slice(6 * k, 6 * k + 6)
@@ -120,21 +106,21 @@ def test_it_is_what_bundle_adjustment_reports(poses, focal):
         np.testing.assert_allclose(found.focal_information, 1.0 / variance, rtol=1e-3)
 
 
-def test_cameras_that_their_tracks_have_elsewhere_are_free_to_go_there():
+def test_cameras_are_free_to_move_where_their_tracks_place_them():
     points = tracked(VIEWS, XYZ, noise=0.05)
     turn, move = np.array([0.01, -0.005, 0.008]), np.array([0.015, 0.01, -0.025])
     given = [*VIEWS[:2], moved(VIEWS[2], turn, move), VIEWS[3]]
     way = np.concatenate([-turn, -move])
-    surely, there = (
+    fixed, free = (
         np.sqrt(way @ pose_priors(views, points, poses=True, focal="fixed").information[2] @ way)
         for views in (VIEWS, given)
     )
-    # In standard deviations. It is still some, as a part of the way counts as that of all cameras.
-    assert surely > 100.0
-    assert there < 0.2 * surely
+    # In standard deviations.
+    assert fixed > 100.0
+    assert free < 0.2 * fixed
 
 
-def test_only_what_the_views_see_counts():
+def test_only_points_that_the_views_see_count():
     points = tracked(VIEWS, XYZ, noise=0.5)
     assert pose_priors(VIEWS, None, poses=True, focal="fixed") is None
     bare = igsr.Points(points.xyz, points.rgb)
@@ -142,12 +128,12 @@ def test_only_what_the_views_see_counts():
     strangers = [replace(view, name=f"other/{view.name}") for view in VIEWS]
     assert pose_priors(strangers, points, poses=True, focal="fixed") is None
     assert pose_priors(VIEWS[:1], points, poses=True, focal="fixed") is None
-    # Held-out photos' tracks say nothing: here they are wrong.
+    # Tracks of held-out photos are ignored.
     wrong = tracked(VIEWS, XYZ, noise=0.5)
     wrong.tracks.xy[wrong.tracks.view == 3] += 50.0
     one, two = (pose_priors(VIEWS[:3], p, poses=True, focal="fixed") for p in (points, wrong))
     np.testing.assert_array_equal(one.information, two.information)
-    # A camera that sees two points, and one that sees none, are not held; the others are.
+    # Cameras that see at most two points are free; cameras with more points are held.
     few = (points.tracks.view < 2) | ((points.tracks.view == 2) & (points.tracks.point < 2))
     tracks = points.tracks
     points.tracks = replace(
@@ -158,45 +144,22 @@ def test_only_what_the_views_see_counts():
     assert np.isfinite(held.information).all()
 
 
-@pytest.fixture(scope="module")
-def made():
+def test_tracks_hold_exact_cameras_that_a_fit_would_move():
     scene = scenes.splats(count=120)
-    return scenes.capture(views=12, size=64, scene=scene), scene.means.astype(np.float64)
-
-
-OPTIONS = {"steps": 250, "backend": "cpu", "max_splats": 400, "poses": "joint", "start": "random"}
-
-
-def test_exact_cameras_with_tracks_stay_where_a_fit_would_move_them(made):
-    capture, means = made
+    capture = scenes.capture(views=12, size=64, scene=scene)
+    points = tracked(capture.train_views, scene.means.astype(np.float64))
     true = [view.camera for view in capture.train_views]
-    points = tracked(capture.train_views, means)
+    options = {"steps": 250, "backend": "cpu", "max_splats": 400, "start": "random"}
     errors = []
     for given in (Capture(capture.path, capture.views, points), capture):
-        _, fitted = scenes.fit_with_cameras(given, **OPTIONS)
+        _, fitted = scenes.fit_with_cameras(given, poses="joint", **options)
         errors.append(pose_errors([view.camera for view in fitted.train_views], true)["rotation"])
     held, free = errors
-    assert held < 0.1 * free, errors
-
-
-def test_a_held_fit_resumes_with_its_own_tracks_alone(made, tmp_path):
-    capture, means = made
-    given = Capture(capture.path, capture.views, tracked(capture.train_views, means, noise=0.3))
-    checkpoint = tmp_path / "checkpoint.npz"
-    options = OPTIONS | {"steps": 90, "focal": "shared"}
-    whole, cameras_whole = scenes.fit_with_cameras(given, **options)
-    scenes.fit(given, checkpoint=checkpoint, progress=lambda now: now.step < 40, **options)
-    part, cameras_part = scenes.fit_with_cameras(given, checkpoint=checkpoint, resume=True, **options)
-    np.testing.assert_array_equal(whole.means, part.means)
-    for a, b in zip(cameras_whole.views, cameras_part.views, strict=True):
-        np.testing.assert_array_equal(a.camera.viewmat, b.camera.viewmat)
-        np.testing.assert_array_equal(a.camera.K, b.camera.K)
-    with pytest.raises(igsr.IgsrError, match="other photos, masks, cameras, tracks"):
-        scenes.fit(capture, checkpoint=checkpoint, resume=True, **options)
+    assert held < 0.1 * free
 
 
 def least_ratio(found, expected, rows):
-    """The least factor by which information about any direction of the cameras has changed."""
+    """Smallest factor by which the information about any direction of the cameras changed."""
     ratios = []
     for k in rows:
         half = np.linalg.cholesky(expected.information[k])
@@ -213,7 +176,7 @@ def test_two_cameras_are_held(focal):
 
 
 @pytest.mark.parametrize("seen", [0, 1, 2])
-def test_a_camera_without_tracks_loosens_no_other(seen):
+def test_a_camera_without_tracks_does_not_loosen_others(seen):
     points = tracked(VIEWS, XYZ, noise=0.5)
     expected = pose_priors(VIEWS, points, poses=True, focal="fixed")
     more = [*VIEWS, replace(VIEWS[0], name="more.png", camera=scenes.ring_camera(-0.4, 64))]
@@ -234,7 +197,7 @@ def test_a_camera_without_tracks_loosens_no_other(seen):
     assert least_ratio(found, expected, range(COUNT)) > 0.9
 
 
-def test_what_no_camera_can_have_seen_changes_little():
+def test_outliers_change_little():
     points = tracked(VIEWS, XYZ, noise=0.5)
     expected = pose_priors(VIEWS, points, poses=True, focal="fixed")
     for wrong in (1e200, 1e6):

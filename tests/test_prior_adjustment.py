@@ -101,7 +101,7 @@ def test_points_in_three_photos_outweigh_the_prediction():
     found = adjusted_bundle(started(bundle, wanted), seen, wanted, SPREAD, 1.0)
     before, after = (pose_errors(one, TRUTH) for one in (wanted, found.cameras))
     assert after["rotation"] < 0.1 * before["rotation"]
-    assert after["centre"] < 0.1 * before["centre"]
+    assert after["center"] < 0.1 * before["center"]
 
 
 def test_the_prediction_decides_if_points_are_in_two_photos():
@@ -128,13 +128,13 @@ def test_depths_decide_too_and_wrong_ones_have_no_influence():
     exact = adjusted_bundle(started(bundle, wanted), seen, wanted, SPREAD, 1.0)
     none = replace(seen, depth=np.full(len(seen.depth), np.nan))
     without = adjusted_bundle(started(bundle, wanted), none, wanted, SPREAD, 1.0)
-    errors = [pose_errors(one.cameras, TRUTH)["centre"] for one in (exact, without)]
+    errors = [pose_errors(one.cameras, TRUTH)["center"] for one in (exact, without)]
     assert errors[0] < 0.8 * errors[1]
     wrong = np.where(seen.view == 2, seen.depth * 3.0, seen.depth)
     found = adjusted_bundle(
         started(bundle, wanted), replace(seen, depth=wrong), wanted, SPREAD, 1.0
     )
-    assert pose_errors(found.cameras, TRUTH)["centre"] < 2.0 * errors[0]
+    assert pose_errors(found.cameras, TRUTH)["center"] < 2.0 * errors[0]
 
 
 def test_a_wrong_prediction_has_no_influence():
@@ -146,7 +146,7 @@ def test_a_wrong_prediction_has_no_influence():
     found = adjusted_bundle(start, seen, wanted, SPREAD, 1.0)
     a, b = (pose_errors(one.cameras, TRUTH) for one in (right, found))
     assert b["rotation"] < a["rotation"] + 0.05
-    assert b["centre"] < a["centre"] + 0.01
+    assert b["center"] < a["center"] + 0.01
 
 
 def test_wrong_matches_have_little_influence():

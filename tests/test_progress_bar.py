@@ -1,4 +1,4 @@
-"""Progress bars: shown where somebody sits before Python, and only the outermost."""
+"""Progress bars: only in interactive sessions, and only for the outermost run."""
 
 from __future__ import annotations
 
@@ -8,12 +8,9 @@ import pytest
 import scenes
 
 import igsr
-from igsr._internal.progress_bar import (
-    BarState,
-    is_interactive,
-    progress_bar,
-    progress_or_bar,
-)
+from igsr._internal.event import CAMERAS_FOUND, NOTE, Event
+from igsr._internal.progress_bar import is_interactive, progress_bar
+from igsr.run import open_run
 
 
 @pytest.fixture
@@ -21,59 +18,91 @@ def interactive(monkeypatch):
     monkeypatch.setattr(sys, "ps1", ">>> ", raising=False)
 
 
-def state(now):
-    return BarState(now, 10, f"at {now}")
-
-
 def test_scripts_are_not_interactive():
     assert not is_interactive()
 
 
-def test_prompts_and_notebooks_are_interactive(monkeypatch):
+@pytest.mark.usefixtures("interactive")
+def test_prompts_are_interactive():
+    assert is_interactive()
+
+
+def test_notebooks_are_interactive(monkeypatch):
     monkeypatch.setitem(sys.modules, "ipykernel.kernelapp", sys)
     assert is_interactive()
-    monkeypatch.delitem(sys.modules, "ipykernel.kernelapp")
-    monkeypatch.setattr(sys, "ps1", ">>> ", raising=False)
-    assert is_interactive()
 
 
-def test_a_bar_shows_where_nobody_asked_for_progress(interactive, capsys):
-    with progress_or_bar(None, "count", state) as report:
-        assert report is not None
-        assert report(3) is None
-        with progress_or_bar(None, "inner", state) as inner:
-            assert inner is None, "one bar at a time"
+@pytest.fixture
+def terminal(monkeypatch):
+    """Let rich take the captured stderr for a terminal."""
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("TERM", "xterm")
+
+
+@pytest.mark.parametrize(
+    ("event", "text"),
+    [
+        (Event("load photos", 3, 10, "at 3"), "load photos 3/10"),
+        (Event("load photos", 3, 10, "at 3"), "at 3"),
+        (Event("fit", 5, 20, part=0.25), "fit 5/20"),
+        (Event(NOTE, message="Found [2] photos."), "Found [2] photos."),
+    ],
+)
+@pytest.mark.usefixtures("terminal")
+def test_the_bar_shows_stages_counts_and_notes(event, text, capsys):
+    with progress_bar() as show:
+        show(event)
     shown = capsys.readouterr()
-    assert "count 3/10" in shown.err
-    assert "at 3" in shown.err
+    assert text in shown.err
     assert not shown.out
 
 
-def test_given_progress_is_passed_on_and_is_all_there_is(interactive, capsys):
-    with progress_or_bar(state, "count", state) as report:
-        assert report is state
-        with progress_or_bar(None, "inner", state) as inner:
-            assert inner is None
+@pytest.mark.usefixtures("terminal")
+def test_the_bar_ignores_files(tmp_path, capsys):
+    with progress_bar() as show:
+        show(Event(CAMERAS_FOUND, path=tmp_path))
     assert capsys.readouterr().err == ""
-    with progress_or_bar(None, "next", state) as report:
-        assert report is not None, "the bars that went before do not count"
 
 
-def test_a_bar_that_never_moved_never_shows(capsys):
-    with pytest.raises(igsr.IgsrError, match="bad"), progress_bar("count"):
+def test_notes_only_are_printed_without_a_terminal(capsys):
+    with progress_bar() as show:
+        show(Event(NOTE, message="a note"))
+        show(Event("fit", 5, 20, part=0.25))
+    assert capsys.readouterr().err == "a note\n"
+
+
+@pytest.mark.usefixtures("terminal")
+def test_a_bar_without_events_prints_nothing(capsys):
+    with pytest.raises(igsr.IgsrError, match="bad"), progress_bar():
         raise igsr.IgsrError("bad settings.")
-    with progress_bar("count", shown=False) as show:
-        show(BarState(1, 2))
+    with progress_bar(shown=False) as show:
+        show(Event("fit", 1, 2))
+        show(Event(NOTE, message="a note"))
     assert capsys.readouterr().err == ""
 
 
-def test_a_fit_shows_a_bar_in_a_session_and_none_in_a_script(monkeypatch, capsys):
+@pytest.mark.usefixtures("interactive", "terminal")
+def test_runs_show_a_bar_unless_they_have_a_listener_or_are_nested(capsys):
+    event, events = Event("count", 3, 10), []
+    with open_run(None, None) as run:
+        run.report(event)
+        with open_run(None, None) as inner:
+            assert not inner.is_followed
+    assert "count 3/10" in capsys.readouterr().err
+    with open_run(None, events.append) as run:
+        run.report(event)
+    assert events == [event]
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.usefixtures("terminal")
+def test_fits_show_a_bar_in_interactive_sessions_only(monkeypatch, capsys):
     capture = scenes.capture(views=4, size=24)
     options = {"steps": 5, "backend": "cpu", "max_splats": 50}
-    scenes.fit(capture, **options)
+    igsr.fit(capture, **options)
     assert capsys.readouterr().err == ""
     monkeypatch.setattr(sys, "ps1", ">>> ", raising=False)
-    scenes.fit(capture, **options)
+    igsr.fit(capture, **options)
     assert "fit 5/5" in capsys.readouterr().err
-    scenes.fit(capture, progress=lambda now: None, **options)
+    igsr.fit(capture, progress=lambda event: None, **options)
     assert capsys.readouterr().err == ""

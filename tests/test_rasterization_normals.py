@@ -82,8 +82,8 @@ def test_normals_have_the_weights_of_the_colors_and_change_no_picture(render_mod
     rotations = torch.eye(3) + 2 * w[:, None, None] * cross + 2 * cross @ cross
     count = torch.arange(30)
     normals = rotations[count, :, scene["scales"].argmin(dim=-1)]
-    centres = -scene["viewmats"][:, :3, 3]  # these cameras are not turned
-    towards = centres[:, None].double() - scene["means"]
+    centers = -scene["viewmats"][:, :3, 3]  # these cameras are not turned
+    towards = centers[:, None].double() - scene["means"]
     facing = (towards * normals).sum(dim=-1, keepdim=True).sign() * normals
     colors = facing.float()
     expected, _, _ = rasterized({**scene, "colors": colors, "backgrounds": None}, sh_degree=None)

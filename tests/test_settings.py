@@ -1,27 +1,24 @@
-"""Settings classes: what they check, and the command line options made from them."""
+"""Settings classes check and normalize their values."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import pytest
-import typer
-from typer.testing import CliRunner
 
 import igsr
 from igsr._internal.settings import about, checked_given, settings_of, validate
-from igsr.cli.settings_options import settings_options
 
 
 @dataclass(frozen=True, kw_only=True)
 class Example:
-    steps: int = field(metadata=about("Optimiser steps.", limits=(1, 10_000)))
-    seed: int = field(default=7, metadata=about("Of everything random.", limits=(0, 2**63 - 1)))
-    start: Literal["auto", "per-camera"] = field(metadata=about("A word.", aliases=("init",)))
-    hull: bool = field(metadata=about("Yes or no."))
-    dropout: float | None = field(default=None, metadata=about("A part.", limits=(0.0, 0.9)))
+    steps: int = field(metadata=about(limits=(1, 10_000)))
+    seed: int = field(default=7, metadata=about(limits=(0, 2**63 - 1)))
+    start: Literal["auto", "per-camera"] = field(metadata=about())
+    hull: bool = field(metadata=about())
+    dropout: float | None = field(default=None, metadata=about(limits=(0.0, 0.9)))
     plain: object = None
 
     def __post_init__(self) -> None:
@@ -31,14 +28,15 @@ class Example:
 GOOD: dict[str, Any] = {"steps": 5, "start": "auto", "hull": True}
 
 
-def test_a_setting_is_named_once():
-    assert list(settings_of(Example)) == ["steps", "seed", "start", "hull", "dropout"]
-    start, dropout = settings_of(Example)["start"], settings_of(Example)["dropout"]
+def test_settings_have_the_types_of_their_fields():
+    settings = settings_of(Example)
+    assert list(settings) == ["steps", "seed", "start", "hull", "dropout"]
+    start, dropout = settings["start"], settings["dropout"]
     assert (start.kind, start.choices, start.optional) == (str, ("auto", "per-camera"), False)
     assert (dropout.kind, dropout.choices, dropout.optional) == (float, (), True)
 
 
-def test_numbers_of_other_libraries_become_plain():
+def test_numpy_numbers_become_pythons():
     made = Example(**GOOD | {"steps": np.uint8(5), "dropout": np.float32(0.5)})
     assert made == Example(**GOOD, dropout=0.5)
     assert (type(made.steps), type(made.dropout)) == (int, float)
@@ -60,7 +58,7 @@ def test_numbers_of_other_libraries_become_plain():
         ({"dropout": "0.5"}, "^dropout must be a number"),
     ],
 )
-def test_a_setting_that_cannot_be_is_named(bad, message):
+def test_invalid_settings_are_named(bad, message):
     with pytest.raises(igsr.IgsrError, match=message):
         Example(**GOOD | bad)
     if not any(value is None for value in bad.values()):
@@ -68,36 +66,9 @@ def test_a_setting_that_cannot_be_is_named(bad, message):
             checked_given(Example, bad)
 
 
-def test_given_settings_are_those_that_are_not_none():
+def test_settings_that_are_none_are_not_given():
     assert checked_given(Example, {"steps": np.int64(3), "hull": None}) == {"steps": 3}
-    with pytest.raises(igsr.IgsrError, match=r"^there is no setting stepz; there are steps, seed"):
+    with pytest.raises(
+        igsr.IgsrError, match=r"^unknown setting stepz; known settings: steps, seed"
+    ):
         checked_given(Example, {"stepz": 3})
-
-
-def test_options_are_made_from_a_settings_class():
-    app, received = typer.Typer(), []
-
-    @app.command()
-    @settings_options(Example, leave_out=("dropout",))
-    def command(
-        path: Annotated[str, typer.Argument()],
-        given: dict[str, Any],
-        last: Annotated[bool, typer.Option("--last")] = False,
-    ) -> None:
-        """What the command does."""
-        received.append((path, given, last))
-
-    def called(*words):
-        return CliRunner().invoke(app, ["there", *words]).exit_code
-
-    assert called() == 0
-    assert called("--steps", "4", "--init", "per-camera", "--no-hull", "--last") == 0
-    assert received == [
-        ("there", {"seed": 7}, False),
-        ("there", {"steps": 4, "seed": 7, "start": "per-camera", "hull": False}, True),
-    ]
-    assert called("--start", "magic") == 2
-    assert called("--dropout", "0.5") == 2
-    shown = CliRunner().invoke(app, ["--help"], env={"COLUMNS": "200"}).output
-    for text in ("What the command does.", "Optimiser steps.", "--init", "--no-hull", "per-camera"):
-        assert text in shown

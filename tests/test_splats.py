@@ -31,7 +31,7 @@ def test_far_origin_survives_a_file(tmp_path):
     splats = scenes.splats(origin=(1e6, -2e6, 30.0))
     path = tmp_path / "scene.ply"
     splats.save(path)
-    camera = scenes.ring_camera(0.4, centre=splats.origin)
+    camera = scenes.ring_camera(0.4, center=splats.origin)
     before = igsr.render(splats, camera, backend="cpu").color
     after = igsr.render(igsr.Splats.load(path), camera, backend="cpu").color
     at_zero = igsr.render(scenes.splats(), scenes.ring_camera(0.4), backend="cpu").color

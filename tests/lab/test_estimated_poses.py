@@ -25,7 +25,7 @@ def data(tmp_path, monkeypatch):
     for index in range(3):
         Image.fromarray(ring.views[index].image).save(tmp_path / "plain" / f"{index}.png")
 
-    def estimator(photos, *, seed, progress):
+    def estimator(photos, *, seed, progress=None):
         nothing = [None] * len(photos)
         cameras = [turned, *(view.camera for view in ring.views[1 : len(photos)])]
         return Estimate(cameras, None, nothing, nothing, [])

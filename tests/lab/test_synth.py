@@ -83,8 +83,8 @@ def test_captures_load_with_the_cameras_written(made: Path) -> None:
             assert view.mask is None
             assert max(view.camera.width, view.camera.height) == 24
             assert view.camera.K[0, 0] == frame["fl_x"]
-            centre = np.array(frame["transform_matrix"])[:3, 3]
-            assert np.allclose(view.camera.center, centre, atol=1e-12)
+            center = np.array(frame["transform_matrix"])[:3, 3]
+            assert np.allclose(view.camera.center, center, atol=1e-12)
             channels = 4 if recipe["family"] == "object" else 3
             assert view.image.shape == (view.camera.height, view.camera.width, channels)
             # Neither black nor burnt out, and not one flat colour.
@@ -101,7 +101,7 @@ def test_masks_and_depths_agree_with_alpha(made: Path) -> None:
         assert (mask == alpha).all()
         depth = np.load(folder / "depth" / Path(view.name).with_suffix(".npy"))
         assert depth.dtype == np.float32
-        # All samples of the pixel hit, so its centre does, but for what thin gaps hide; and back.
+        # All samples of the pixel hit, so its center does, but for what thin gaps hide; and back.
         assert np.isfinite(depth[alpha == 255]).mean() > 0.95
         assert np.isnan(depth[alpha == 0]).mean() > 0.95
         assert (alpha == 0).any()
@@ -224,7 +224,7 @@ def ball_on_plane() -> Description:
         np.ones((4, 8, 3)),
         [Part(sheet(6.0, 6.0), grey)],
         radius=0.6,
-        centre=np.array([0.0, 0.0, 0.5]),
+        center=np.array([0.0, 0.0, 0.5]),
     )
 
 

@@ -1,4 +1,4 @@
-"""What each part of a run takes: seconds, processor seconds, peak memory."""
+"""Time and peak memory of the parts of a run."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from igsr._internal.peak_memory import forget_peak, peak_bytes
 
 @dataclass(frozen=True)
 class Usage:
-    """What a part took.
+    """Time and memory of a part.
 
     Attributes:
-        seconds: on the clock.
-        cpu_seconds: of all cores together, in this process and its children that have ended.
-        peak_memory_bytes: most that the process had in memory during the part, with what earlier
-            parts left there. Where the system cannot count anew for each part, the most since the
-            process began; None where it does not say.
+        seconds: elapsed time.
+        cpu_seconds: CPU time of this process and of its children that have ended.
+        peak_memory_bytes: peak memory of the process during the part, memory of earlier parts
+            included; on systems that cannot reset the peak, since the process began. None if the
+            system does not measure it.
     """
 
     seconds: float
@@ -30,16 +30,16 @@ class Usage:
     peak_memory_bytes: int | None
 
     def __add__(self, other: Usage) -> Usage:
-        """Both, one after the other."""
+        """The usage of both parts in sequence."""
         peaks = [p for p in (self.peak_memory_bytes, other.peak_memory_bytes) if p is not None]
         return Usage(
             self.seconds + other.seconds,
             self.cpu_seconds + other.cpu_seconds,
-            max(peaks) if peaks else None,
+            max(peaks, default=None),
         )
 
     def plain(self) -> dict[str, Any]:
-        """As reports have it."""
+        """The usage for JSON."""
         return {
             **asdict(self),
             "seconds": round(self.seconds, 3),
@@ -48,10 +48,10 @@ class Usage:
 
     @staticmethod
     def of(found: Mapping[str, Any]) -> Usage:
-        """What ``plain`` gave, read again.
+        """Read the result of ``plain``.
 
         Raises:
-            KeyError, TypeError, ValueError, OverflowError: it is nothing such.
+            KeyError, TypeError, ValueError, OverflowError: it is damaged.
         """
         numbers = float(found["seconds"]), float(found["cpu_seconds"])
         peak = None if found["peak_memory_bytes"] is None else int(found["peak_memory_bytes"])
@@ -61,34 +61,32 @@ class Usage:
 
 
 class Meter:
-    """What is used from one moment to the next."""
+    """Measures the usage between two moments."""
 
     def __init__(self) -> None:
-        """Begin now."""
-        self._begin()
+        self._start()
 
     def lap(self) -> Usage:
-        """What was used since the last call, or since the beginning."""
-        now, cpu, peak = time.monotonic(), cpu_seconds(), peak_bytes()
-        usage = Usage(now - self._began, cpu - self._cpu, peak)
-        self._begin()
+        """The usage since the last call or the creation."""
+        now, cpu, peak = time.monotonic(), _cpu_seconds(), peak_bytes()
+        usage = Usage(now - self._started, cpu - self._cpu, peak)
+        self._start()
         return usage
 
-    def _begin(self) -> None:
+    def _start(self) -> None:
         forget_peak()
-        self._began, self._cpu = time.monotonic(), cpu_seconds()
+        self._started, self._cpu = time.monotonic(), _cpu_seconds()
 
 
 class Parts:
-    """The usage of parts, by name, in the order in which they were first begun."""
+    """The usage of parts, by name, in the order in which they began."""
 
     def __init__(self) -> None:
-        """No part yet."""
         self.used: dict[str, Usage] = {}
 
     @contextlib.contextmanager
     def measured(self, name: str) -> Iterator[None]:
-        """Count what happens inside to a part; one that is named again is added up."""
+        """Measure a part; parts of the same name are added up."""
         meter = Meter()
         try:
             yield
@@ -96,27 +94,19 @@ class Parts:
             self.add(name, meter.lap())
 
     def add(self, name: str, usage: Usage) -> None:
-        """Count a usage to a part."""
+        """Add usage to a part."""
         before = self.used.get(name)
         self.used[name] = usage if before is None else before + usage
 
     def plain(self) -> dict[str, dict[str, Any]]:
-        """As reports have it: the usage of each part by its name."""
+        """The usage of each part, for JSON."""
         return {name: usage.plain() for name, usage in self.used.items()}
 
 
 def total(parts: Mapping[str, Mapping[str, Any]]) -> Usage:
-    """All parts of a report together.
-
-    Args:
-        parts: as ``Parts.plain`` gives them.
-    """
-    whole = Usage(0.0, 0.0, None)
-    for part in parts.values():
-        whole += Usage.of(part)
-    return whole
+    """The sum of all parts of a report, as ``Parts.plain`` gives them."""
+    return sum(map(Usage.of, parts.values()), Usage(0.0, 0.0, None))
 
 
-def cpu_seconds() -> float:
-    """Processor seconds of this process so far, with those of its children that have ended."""
+def _cpu_seconds() -> float:
     return sum(os.times()[:4])

@@ -52,7 +52,7 @@ def progress_bar(*, shown: bool = True) -> Iterator[Callable[[Event], None]]:
             for task in tasks.values():
                 bar.update(task, visible=False)
             tasks[key] = bar.add_task(event.stage, total=None, counts="", message="")
-        counts = f"{event.done:.0f}/{event.total:.0f}" if event.total > 1 else ""
+        counts = f"{int(event.done)}/{event.total:.0f}" if event.total > 1 else ""
         done, total = (event.done, event.total) if event.part is None else (event.part, 1.0)
         bar.update(
             tasks[key],

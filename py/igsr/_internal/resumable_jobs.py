@@ -14,7 +14,7 @@ from typing import Any
 from igsr import _core
 from igsr._internal.atomic_write import atomic_write
 from igsr._internal.ray_jobs import RayCluster
-from igsr._internal.worker_processes import WorkerLostError, worker_processes
+from igsr._internal.worker_processes import worker_processes
 from igsr.errors import IgsrError
 
 
@@ -29,7 +29,6 @@ class Run:
         leaves: a file that it leaves beside its row, if any; without that it is not done.
         scene: its folder in the data; the hash of all its files joins the settings, as "data",
             since photos and cameras may be corrected. None where the settings say all.
-        memory: bytes that it takes, where that is known: Ray starts no more than fit.
     """
 
     name: str
@@ -37,7 +36,6 @@ class Run:
     settings: dict[str, Any]
     leaves: Path | None = None
     scene: str | None = None
-    memory: int | None = None
 
 
 def file_hash(path: Path) -> str:
@@ -61,11 +59,7 @@ def finished_runs(
     data: str,
     jobs: int,
     on_run: Callable[[int, int, dict[str, Any]], None] | None,
-    ray: bool | str = False,
-    *,
-    again: Callable[[Run, Exception], Any] | None = None,
-    spread: bool = False,
-    shared: Path | None = None,
+    ray: bool = False,
 ) -> list[dict[str, Any]]:
     """The row of every run, in order: read where its file is there, else done and written.
 
@@ -81,12 +75,7 @@ def finished_runs(
         jobs: runs at a time on this machine, each in a process of its own with its share of cores.
         on_run: called with (done, all, the run's row) after each run.
         ray: run on the Ray cluster that this machine is part of, or on a local one, as many at a
-            time as it has room for; its machines see ``data`` under the same path. A text is the
-            cluster's address (``igsr._internal.ray_jobs``).
-        again: called with a run and the exception where memory ran out or its process ended without
-            a result; what it returns, if not None, is given to ``work`` once more.
-        spread: over Ray, whether a run takes its share of a machine's cores, not one.
-        shared: over Ray, a folder that all machines must see.
+            time as it has room for; its machines see ``data`` under the same path.
 
     Raises:
         IgsrError: a run fails, its file cannot be read or written, or Ray is not installed.
@@ -119,10 +108,12 @@ def finished_runs(
             on_run(len(rows), len(runs), row)
 
     if ray and missing:
-        _over_ray(missing, work, data, keep, ray, again, spread, shared)
+        with RayCluster() as cluster:
+            cluster.check(Path(data).resolve())
+            cluster.run(lambda run: work(data, run.what), missing, keep)
     elif jobs == 1:
         for run in missing:
-            keep(run, _done(work, data, run, again))
+            keep(run, work(data, run.what))
     elif missing:
         threads = max(1, (os.cpu_count() or 1) // jobs)
         with worker_processes(jobs, threads) as pool:
@@ -138,52 +129,6 @@ def finished_runs(
                         keep(run, other.result())
                 raise
     return [rows[run.name] for run in runs]
-
-
-def _done(
-    work: Callable[[str, Any], dict[str, Any]],
-    data: str,
-    run: Run,
-    again: Callable[[Run, Exception], Any] | None,
-) -> dict[str, Any]:
-    """The row of a run, done with what ``again`` makes of it as often as memory runs out."""
-    what = run.what
-    while True:
-        try:
-            return work(data, what)
-        except (WorkerLostError, MemoryError) as error:
-            other = None if again is None else again(run, error)
-            if other is None:
-                raise
-            what = other
-
-
-def _over_ray(
-    runs: list[Run],
-    work: Callable[[str, Any], dict[str, Any]],
-    data: str,
-    keep: Callable[[Run, dict[str, Any]], None],
-    ray: bool | str,
-    again: Callable[[Run, Exception], Any] | None,
-    spread: bool,
-    shared: Path | None,
-) -> None:
-    """``keep`` is called with each run as it is done; after a failure, those under way are kept."""
-
-    def other(number: int, error: Exception) -> Any:
-        return None if again is None else again(runs[number], error)
-
-    with RayCluster(ray if isinstance(ray, str) else None) as cluster:
-        cluster.check(shared)
-        cluster.do(
-            work,
-            data,
-            [run.what for run in runs],
-            lambda number, row: keep(runs[number], row),
-            memory=[run.memory for run in runs],
-            spread=spread,
-            again=other,
-        )
 
 
 def _read(path: Path) -> dict[str, Any] | None:

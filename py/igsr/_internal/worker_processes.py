@@ -1,4 +1,4 @@
-"""Processes that do independent work side by side and end with the one that started them."""
+"""Worker processes, which end with the process that started them."""
 
 from __future__ import annotations
 
@@ -15,34 +15,33 @@ from igsr.errors import IgsrError
 
 T = TypeVar("T")
 
-#: Environment variables that say how many threads to start.
+#: Environment variables that set the number of threads.
 THREADS = ("RAYON_NUM_THREADS", "OMP_NUM_THREADS")
 
 
 class WorkerLostError(IgsrError):
-    """A process that did work ended without a result, for example because memory ran out."""
+    """A worker process ended without a result, for example because memory ran out."""
 
 
 def worker_processes(count: int, threads: int | None = None) -> ProcessPoolExecutor:
-    """A pool of ``count`` processes, each with ``threads`` threads (None: as they like).
+    """Start a pool of ``count`` processes with ``threads`` threads each (None: the default).
 
-    They are started anew and not forked, since threads do not survive that. A pool's processes
-    would work on by themselves if the one that started them was killed.
+    They are spawned, because forked processes lose the threads of the renderer.
     """
     context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(count, context, _begin, (threads,))
+    return ProcessPoolExecutor(count, context, _initialize, (threads,))
 
 
-def _begin(threads: int | None) -> None:
-    """In a worker, before anything starts threads."""
-    # Ctrl-C goes to all processes of a terminal. The one that started them says what it means.
+def _initialize(threads: int | None) -> None:
+    # Ctrl-C reaches all processes of a terminal; the parent reports it.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     if threads is not None:
         os.environ.update(dict.fromkeys(THREADS, str(threads)))
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
 
 
-def _end_with_parent() -> None:
+def _exit_with_parent() -> None:
+    """A pool's processes would otherwise continue after their parent was killed."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()
@@ -50,11 +49,11 @@ def _end_with_parent() -> None:
 
 
 def in_a_process(work: Callable[..., T], *arguments: Any) -> T:
-    """Call a function of a module in a process of its own, which ends with the call.
+    """Call a module-level function in a new process, which frees its memory at the end.
 
     Raises:
-        WorkerLostError: the process was ended from outside, for example because memory ran out.
-        Exception: what the function raises.
+        WorkerLostError: the process was killed, for example because memory ran out.
+        Exception: raised by the function.
     """
     with worker_processes(1) as pool:
         try:

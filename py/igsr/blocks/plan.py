@@ -1,164 +1,141 @@
-"""From the coarse scene to what each block is fitted to."""
+"""The plan of a fit in blocks: the number of blocks, their cells and their photos."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from igsr._internal.choices import Backend
-from igsr.blocks.assignment import photos_across_seams, photos_of_blocks
-from igsr.blocks.cells import Cell, Ground, ground_of, split_into_cells
+from igsr.blocks.cells import Grid, centers_of
+from igsr.blocks.crops import Box
 from igsr.blocks.manifest import Manifest
-from igsr.blocks.photo_parts import ALL, Box, boxes_of
-from igsr.blocks.shares import shown_shares, tracked_shares
+from igsr.blocks.visibility import splat_visibility, track_visibility, visible_boxes
 from igsr.capture.downscaling import reduced_size
 from igsr.capture.memory_check import LIBRARY_BYTES, USABLE_PART, available_memory
 from igsr.capture.photos import shot_sizes
 from igsr.capture.types import Points
 from igsr.splats import Splats
 
-#: Photos of a block where nothing else bounds their number.
-PHOTOS_PER_BLOCK = 250
-#: Part of the photos of neighbouring cells that a block has beside its own.
-SHARED = 0.5
+Bool = npt.NDArray[np.bool_]
+Float64 = npt.NDArray[np.float64]
+
+#: Maximum number of photos per block, without those shared with neighbors.
+MAX_BLOCK_PHOTOS = 250
+#: Photos that a block shares with its neighbors, relative to its own.
+SHARED_FRACTION = 0.5
+#: A block is fitted to the photos that show it in at least this fraction of the picture
+#: (VastGaussian) ...
+MIN_VISIBILITY = 0.25
+#: ... or in this one, for photos taken inside the block.
+MIN_VISIBILITY_INSIDE = 0.05
+#: A photo shows a seam if each of two cells fills at least this fraction of it.
+MIN_SEAM_VISIBILITY = 0.1
+#: Number of splats for memory estimates if no maximum is given.
+ESTIMATED_SPLATS = 200_000
 
 
 @dataclass(frozen=True, eq=False)
 class BlockPlan:
-    """The split of a capture into C blocks.
+    """The partition of a capture of P photos into C blocks.
 
     Attributes:
-        ground: the plane of the cells.
-        cells: C cells proper; every place lies in one.
-        photos: bool [P, C], which photos of the capture each block is fitted to.
-        across: bool [P], which photos show a seam.
-        shown: float64 [P, C], part of each photo that the coarse splats of each cell proper are.
-        boxes: for each photo, by block, the part of it that the block is fitted to.
+        grid: the cells of the blocks.
+        photos: bool [P, C], the photos that each block is fitted to.
+        across: bool [P], the photos that show a seam.
+        boxes: the part of each photo that each block is fitted to, by photo and block.
     """
 
-    ground: Ground
-    cells: list[Cell]
-    photos: npt.NDArray[np.bool_]
-    across: npt.NDArray[np.bool_]
-    shown: npt.NDArray[np.float64]
+    grid: Grid
+    photos: Bool
+    across: Bool
     boxes: list[dict[int, Box]]
 
-    def box(self, photo: int, block: int) -> Box:
-        """The part of a photo that a block is fitted to."""
-        return self.boxes[photo].get(block, ALL)
-
     @property
-    def largest_part(self) -> float:
-        """The pixels of the block that has most, in whole photos."""
+    def largest_area(self) -> float:
+        """Total area of the photos of the block with the most pixels, in whole photos."""
         return max(
-            sum(self.box(int(photo), block).part for photo in np.flatnonzero(photos))
+            sum(self.boxes[photo][block].area for photo in np.flatnonzero(photos))
             for block, photos in enumerate(self.photos.T)
         )
 
-    def plain(self) -> list[dict[str, Any]]:
-        """As reports have it: each cell with its number of photos."""
-        return [
-            {**cell.plain(), "photos": int(count)}
-            for cell, count in zip(self.cells, self.photos.sum(axis=0), strict=True)
-        ]
-
-
-def cells_of(manifest: Manifest, count: int) -> tuple[Ground, list[Cell]]:
-    """The ground plane of a capture, and its cells by the photos to fit.
-
-    Raises:
-        IgsrError: there are more cells than photos, or too many photos stand at one place.
-    """
-    cameras = [manifest.shots[index].camera for index in manifest.of_split("train")]
-    ground = ground_of(cameras)
-    places = ground.places(np.stack([camera.center for camera in cameras]))
-    return ground, split_into_cells(places, count)
-
 
 def plan_blocks(
-    manifest: Manifest,
-    ground: Ground,
-    cells: list[Cell],
-    coarse: Splats,
-    points: Points | None,
-    backend: Backend,
+    manifest: Manifest, grid: Grid, coarse: Splats, points: Points | None, backend: Backend
 ) -> BlockPlan:
-    """Assign photos to blocks.
+    """Assign the train photos to blocks by the coarse scene and by tracks, and find the seams."""
+    cameras = [shot.camera for shot in manifest.shots]
+    positions = grid.splat_positions(coarse)
+    expanded = grid.inside(positions, expanded=True)
+    groups = np.concatenate([grid.inside(positions), expanded], axis=1)
+    visibility = splat_visibility(coarse, cameras, groups, backend)
+    own, overlapping = np.split(visibility, 2, axis=1)
+    xyz = np.zeros((0, 3)) if points is None else points.xyz
+    tracked = track_visibility(
+        points,
+        [shot.name for shot in manifest.shots],
+        grid.inside(grid.positions(xyz), expanded=True),
+    )
+    camera_positions = grid.positions(centers_of(cameras))
+    photos = assign_photos(
+        np.maximum(overlapping, tracked), grid.inside(camera_positions, expanded=True)
+    )
+    photos[[shot.split != "train" for shot in manifest.shots]] = False
+    boxes = visible_boxes(coarse, cameras, expanded, photos, overlapping.argmax(axis=1), backend)
+    return BlockPlan(grid, photos, photos_across_seams(own), boxes)
 
-    Held-out photos are assigned to none, but it is told whether they show a seam.
+
+def assign_photos(visibility: Float64, inside: Bool) -> Bool:
+    """Assign photos to blocks, bool [P, C]; each photo that shows a block is assigned to one.
 
     Args:
-        manifest: the capture's photos.
-        ground, cells: of ``cells_of``.
-        coarse: the coarse scene.
-        points: of the capture, with tracks; or None.
-        backend: "cpu" or "gpu".
+        visibility: [P, C], fraction of each photo that shows each expanded cell.
+        inside: bool [P, C], whether the camera is in the expanded cell.
     """
-    cameras = [shot.camera for shot in manifest.shots]
-    widened = [cell.widened() for cell in cells]
-    count = len(cells)
-    shares = shown_shares(coarse, cameras, [*cells, *widened], ground, backend)
-    names = [shot.name for shot in manifest.shots]
-    tracked = tracked_shares(points, names, widened, ground)
-    places = ground.places(np.stack([camera.center for camera in cameras]))
-    near = np.stack([cell.holds(places) for cell in widened], axis=1)
-    photos = photos_of_blocks(shares[:, count:], tracked, near)
-    photos[[shot.split != "train" for shot in manifest.shots]] = False
-    proper, wide = shares[:, :count], shares[:, count:]
-    places = ground.places(coarse.means.astype(np.float64) + coarse.origin)
-    inside = np.stack([cell.holds(places) for cell in widened], axis=1)
-    boxes = boxes_of(coarse, cameras, inside, photos, wide.argmax(axis=1), backend)
-    return BlockPlan(ground, cells, photos, photos_across_seams(proper), proper, boxes)
+    assigned: Bool = visibility >= MIN_VISIBILITY
+    assigned |= inside & (visibility >= MIN_VISIBILITY_INSIDE)
+    unassigned = ~assigned.any(axis=1) & (visibility.max(axis=1, initial=0.0) > 0.0)
+    assigned[unassigned, visibility[unassigned].argmax(axis=1)] = True
+    return assigned
+
+
+def photos_across_seams(visibility: Float64) -> Bool:
+    """Whether each of P photos shows a seam, by the visibility [P, C] of cells without overlap."""
+    across: Bool = (visibility >= MIN_SEAM_VISIBILITY).sum(axis=1) >= 2
+    return across
 
 
 def blocks_for_memory(
     manifest: Manifest, max_size: int | None, splats: int | None, available: int | None = None
 ) -> int:
-    """How many blocks a capture needs so that each fits into memory.
-
-    Args:
-        manifest: the capture's photos.
-        max_size: longest side in pixels of photos as loaded, or None.
-        splats: most splats of the whole scene, where that is given.
-        available: bytes; None: what this machine has free.
-    """
+    """The number of blocks such that each fits into the available bytes (None: free memory)."""
     train = manifest.of_split("train")
     usable = USABLE_PART * (available_memory() if available is None else available)
     whole = memory_of(manifest, train, max_size, splats)
     per_photo = max(0, whole - LIBRARY_BYTES) / max(1, len(train))
-    photos = max(1.0, (usable - LIBRARY_BYTES) / max(per_photo, 1.0) / (1.0 + SHARED))
-    needed = math.ceil(len(train) / min(photos, PHOTOS_PER_BLOCK))
+    photos = max(1.0, (usable - LIBRARY_BYTES) / max(per_photo, 1.0) / (1.0 + SHARED_FRACTION))
+    needed = math.ceil(len(train) / min(photos, MAX_BLOCK_PHOTOS))
     return min(max(1, needed), max(1, len(train)))
 
 
 def memory_of(
     manifest: Manifest,
-    photos: list[int],
+    photos: Sequence[int],
     max_size: int | None,
     splats: int | None = None,
     boxes: Sequence[Box] | None = None,
 ) -> int:
-    """Bytes that a fit to these photos takes at most.
-
-    Args:
-        manifest: the capture's photos.
-        photos: their numbers in it.
-        max_size: longest side in pixels of photos as loaded, or None.
-        splats: most splats of the fit; None: what presets would have for them.
-        boxes: parts of the photos that are fitted; None: all of each.
-    """
+    """Estimate the maximum memory of a fit to photos, or to boxes in them, in bytes."""
     shots = [manifest.shots[index] for index in photos]
     headers = [manifest.headers[index] for index in photos]
     sizes = shot_sizes(shots, headers)
     if boxes is not None:
-        parts = [
+        cropped = [
             box.size(*reduced_size(*size, max_size))
             for box, size in zip(boxes, sizes.sizes, strict=True)
         ]
-        sizes = replace(sizes, sizes=parts)
-    return sizes.needed_memory(max_size, 200_000 if splats is None else splats)
+        sizes = replace(sizes, sizes=cropped)
+    return sizes.needed_memory(max_size, ESTIMATED_SPLATS if splats is None else splats)

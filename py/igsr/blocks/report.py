@@ -1,110 +1,131 @@
-"""What ``igsr fit --blocks`` reports: each block, seams, and scores of held-out photos."""
+"""``report.json`` and ``report.html`` of a fit in blocks."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from igsr import _core
-from igsr._internal.choices import Backend
+from igsr._internal.choices import Split
 from igsr.blocks.manifest import Manifest
-from igsr.blocks.options import BlockOptions
 from igsr.blocks.plan import BlockPlan
-from igsr.blocks.seams import loaded_in_parts
-from igsr.blocks.task_making import name_of
+from igsr.blocks.tasks import Context, block_name
 from igsr.capture import Capture
-from igsr.capture.exposure import Exposure
 from igsr.evaluation.quick_scores import MAX_TRAIN_PHOTOS
-from igsr.evaluation.scores import METRICS, default_background, evaluate
+from igsr.evaluation.report_page import (
+    ADDED,
+    PHOTO,
+    beside,
+    drawn_cameras,
+    number,
+    part_rows,
+    scene_frame,
+    write_template,
+)
+from igsr.evaluation.scores import METRICS, ScoredView, default_background, evaluate
+from igsr.rendering.scene_page import PageCamera, PageModel
 from igsr.splats import Splats
 
+#: Maximum number of photos on the page, and of cameras.
+MAX_PAGE_PHOTOS = 6
+MAX_PAGE_CAMERAS = 500
+#: Fields of rows that the report leaves out.
+OMITTED_FIELDS = ("across", "exposures", "key", "name")
 
-def held_out_scores(
-    manifest: Manifest,
-    plan: BlockPlan,
-    splats: Splats,
-    exposures: Mapping[str, Exposure],
-    options: BlockOptions,
-) -> dict[str, Any]:
-    """Mean scores of held-out photos, and of those of them across seams; a few in memory at a time.
 
-    Where none is held out, of some fitted photos.
-    """
-    split = "test" if manifest.of_split("test") else "train"
+def score_photos(
+    context: Context, plan: BlockPlan, splats: Splats
+) -> tuple[dict[str, Any], list[ScoredView]]:
+    """Score held-out photos, or some train photos if none is held out; for report and page."""
+    options, manifest = context.options, context.manifest
+    split: Split = "test" if manifest.of_split("test") else "train"
     photos = manifest.of_split(split)
     count = len(photos)
-    if split == "train" and count > MAX_TRAIN_PHOTOS:
-        photos = [photos[int(i)] for i in np.linspace(0, count - 1, MAX_TRAIN_PHOTOS).round()]
-    across = {manifest.shots[index].name for index in photos if plan.across[index]}
+    if split == "train":
+        photos = _evenly_spaced(photos, MAX_TRAIN_PHOTOS)
+    across = [index for index in photos if plan.across[index]]
+    page_names = context.names(_evenly_spaced(across or photos, MAX_PAGE_PHOTOS))
+    page_views: list[ScoredView] = []
+
+    def keep_for_page(scored: ScoredView) -> None:
+        if scored.name in page_names:
+            page_views.append(scored)
+
     rows: list[dict[str, Any]] = []
     protocol: dict[str, Any] = {}
-    for views in loaded_in_parts(manifest, photos, options.max_size, exposures, as_taken=True):
+    for views in context.loaded(photos):
+        views = [replace(view, exposure=context.exposures.get(view.name)) for view in views]
         capture = Capture(manifest.path, views)
-        color = options.background or default_background(capture)
-        backend = cast(Backend, options.backend)
-        scores = evaluate(splats, capture, cast(Any, split), color, backend)
+        background = options.background or default_background(capture)
+        scores = evaluate(splats, capture, split, background, options.backend, keep_for_page)
         rows += [dict(row) for row in scores.views]
         protocol = dict(scores.protocol)
     protocol |= {"views": len(rows), "holdout": options.holdout}
     if len(rows) < count:
         protocol["of"] = count
+    across_names = set(context.names(across))
     for row in rows:
-        row["across"] = row["name"] in across
-    crossing = [row for row in rows if row["across"]]
-    return {
+        row["across"] = row["name"] in across_names
+    rows_across = [row for row in rows if row["across"]]
+    report = {
         **_means(rows),
-        "across_seams": {"photos": len(crossing), **_means(crossing)},
+        "across_seams": {"photos": len(rows_across), **_means(rows_across)},
         "protocol": protocol,
         "views": rows,
     }
+    return report, page_views
+
+
+def _evenly_spaced(indices: Sequence[int], count: int) -> list[int]:
+    chosen = np.linspace(0, len(indices) - 1, min(count, len(indices))).round()
+    return [indices[int(index)] for index in chosen]
 
 
 def _means(rows: list[dict[str, Any]]) -> dict[str, float | None]:
-    """The mean of each score over the photos that have it."""
     known = {name: [row[name] for row in rows if row[name] is not None] for name in METRICS}
     return {name: float(np.mean(values)) if values else None for name, values in known.items()}
 
 
 def block_report(
-    path: Path,
-    options: BlockOptions,
+    context: Context,
     plan: BlockPlan,
     coarse: Mapping[str, Any],
-    rows: Mapping[str, Mapping[str, Any]],
+    rows: Sequence[Mapping[str, Any]],
     splats: Splats,
 ) -> dict[str, Any]:
-    """What is known of the blocks, as ``report.json`` has it.
-
-    Args:
-        path: the capture.
-        options: of the run.
-        plan: the split.
-        coarse: the row of the coarse fit.
-        rows: those of the blocks that were fitted, by name.
-        splats: the joined scene.
-    """
+    """The report, from the rows of the coarse fit and of the blocks, without scores."""
+    options, row_of = context.options, {row["name"]: row for row in rows}
     blocks = []
-    for index, cell in enumerate(plan.plain()):
-        name = name_of(index)
-        row = {key: value for key, value in rows.get(name, {}).items() if key not in _NOT_TOLD}
-        blocks.append({"name": name, **cell, "fitted": name in rows, **row})
-    peaks = [row["peak_memory_bytes"] for row in rows.values() if row["peak_memory_bytes"]]
+    for index, cell in enumerate(plan.grid.cells):
+        name = block_name(index)
+        blocks.append(
+            {
+                "name": name,
+                **cell.plain(),
+                "photos": int(plan.photos[:, index].sum()),
+                "fitted": name in row_of,
+                **_reported_fields(row_of.get(name, {})),
+            }
+        )
+    peaks = [row["peak_memory_bytes"] for row in rows if row["peak_memory_bytes"]]
     return {
-        "capture": str(path),
+        "capture": str(context.manifest.path),
         "splats": len(splats),
-        "coarse": {key: value for key, value in coarse.items() if key not in _NOT_TOLD},
+        "coarse": _reported_fields(coarse),
         "blocks": blocks,
+        "background_splats": len(splats) - sum(row["splats"] for row in rows),
         "peak_memory_bytes": max(peaks, default=None),
-        "ground": plan.ground.axes.tolist(),
+        "ground": plan.grid.axes.tolist(),
         "photos": {
             "given": len(plan.photos),
             "train": int(plan.photos.any(axis=1).sum()),
             "across_seams": int(plan.across.sum()),
         },
-        "hosts": sorted({row["host"] for row in rows.values()}),
+        "hosts": sorted({row["host"] for row in rows}),
         **_core.backend_info(options.backend),
         "version": _core.__version__,
         "settings": {
@@ -116,4 +137,57 @@ def block_report(
     }
 
 
-_NOT_TOLD = ("settings", "across", "exposures", "igsr", "name")
+def _reported_fields(row: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in row.items() if name not in OMITTED_FIELDS}
+
+
+def write_block_page(
+    path: Path,
+    report: Mapping[str, Any],
+    manifest: Manifest,
+    splats: Splats,
+    views: Sequence[ScoredView],
+) -> None:
+    """Write ``report.html``, a single file that shows the scene and some scored views."""
+    cameras = {
+        split: [
+            PageCamera(manifest.shots[index].name, manifest.shots[index].camera)
+            for index in _evenly_spaced(manifest.of_split(split), MAX_PAGE_CAMERAS)
+        ]
+        for split in ("train", "test")
+    }
+    train, test = ([camera.camera for camera in of_split] for of_split in cameras.values())
+    held_out = report["protocol"]["split"] == "test"
+    background = report["protocol"]["background"]
+    capture = Path(report["capture"]).resolve()
+    name = (capture.parent.name if capture.name == "images" else capture.name) or "photos"
+    text = "Held-out photos" if held_out else "Fitted photos; none is held out"
+    across = report["across_seams"]
+    views_label = f"{report['protocol']['views']} {'held out' if held_out else 'fitted'}"
+    score_rows = [_score_row(views_label, report)]
+    if across["photos"]:
+        text += ", across seams"
+        score_rows.append(_score_row(f"{across['photos']} of them across seams", across))
+    variables = {
+        **report,
+        "name": name,
+        "limit": None,
+        "scene": scene_frame([PageModel(name, splats)], cameras["train"], background, name),
+        "score_rows": score_rows,
+        "held_out": bool(test),
+        "beside_text": f"{text}.",
+        "beside_views": beside(views),
+        "cameras": drawn_cameras([(PHOTO, train), (ADDED, test)], train),
+        "not_registered": [],
+        "parts": part_rows(report["parts"], {}),
+        "peak_memory": report["peak_memory_bytes"],
+        "backend": f"{report['backend']} ({report['instruction_set']})",
+        "seed": report["settings"].get("seed", 0),
+    }
+    write_template(path, Path(__file__).with_name("templates"), "blocks.html.jinja", variables)
+
+
+def _score_row(label: str, scores: Mapping[str, Any]) -> dict[str, str]:
+    digits = {"psnr": 2, "ssim": 4, "ms_ssim": 4, "flip": 4}
+    values = {name: number(scores.get(name), places) for name, places in digits.items()}
+    return {"label": label, **values}

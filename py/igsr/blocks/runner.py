@@ -1,151 +1,142 @@
-"""Has the tasks of a run done, here or on a cluster, and tells where they stand."""
+"""Run tasks, one after another in processes of this machine or on a Ray cluster."""
 
 from __future__ import annotations
 
 import contextlib
-import warnings
-from collections.abc import Callable, Sequence
+import json
+import threading
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from igsr import _core
-from igsr._internal.resumable_jobs import Run, finished_runs
-from igsr.blocks.progress import Standing, watched
-from igsr.blocks.tasks import CHECKPOINT, PROGRESS, SPLATS, FitTask
-from igsr.blocks.worker import do_task, in_own_process
+from igsr._internal.event import Event, Listener
+from igsr._internal.json_file import write_json
+from igsr._internal.ray_jobs import RayCluster
+from igsr._internal.user_warning import warn_user
+from igsr._internal.worker_processes import WorkerLostError, in_a_process
+from igsr.blocks.tasks import CHECKPOINT_FILE, PROGRESS_FILE, SPLATS_FILE, FitTask
+from igsr.blocks.worker import read_progress, run_task
 from igsr.errors import IgsrError
 
-#: Where memory runs out, a block is fitted again with this part of the splats, so many times.
-LESS, LESS_OFTEN = 0.5, 2
+#: Each time that memory runs out, a block gets this fraction of its splats, down to the minimum.
+RETRY_FRACTION = 0.5
+MIN_SPLATS_PART = 0.25
+#: Seconds between two progress events.
+REPORT_INTERVAL_S = 1.0
 
 
-class Runner:
-    """Has tasks done, here or on a cluster, and tells where they stand."""
+def run_tasks(
+    stage: str, tasks: Sequence[FitTask], ray: str | None, progress: Listener | None
+) -> list[dict[str, Any]]:
+    """Run the tasks that are not finished, and return the report row of each.
 
-    def __init__(
-        self,
-        out: Path,
-        capture: str,
-        backend: str,
-        ray: str | None,
-        told: Callable[[list[Standing]], None] | None,
-    ) -> None:
-        """Begin without a task.
+    Raises:
+        IgsrError: a task fails; the message names it. Finished tasks are kept.
+        UserWarning: a task is started again, or machines of the cluster differ.
+    """
+    rows: dict[str, dict[str, Any]] = {}
+    for task in tasks:
+        with contextlib.suppress(OSError, ValueError):
+            row = json.loads(task.row_file.read_text(encoding="utf-8"))
+            if row.get("key") == task.key() and (task.folder / SPLATS_FILE).is_file():
+                rows[task.name] = row
+    missing = [task for task in tasks if task.name not in rows]
 
-        Args:
-            out: folder of the run.
-            capture: the capture, for messages.
-            backend: "cpu" or "gpu".
-            ray: address of a Ray cluster; None: one task after another, each in its own process.
-            told: called now and then with where all tasks stand.
-        """
-        self._folder, self._capture = out / "blocks", capture
-        self._backend, self._ray = backend, ray
-        self._told = told
-        self._done: set[str] = set()
-        self._all: list[tuple[str, Path]] = []
-        self._lost: set[str] = set()
-        self._less: dict[str, int] = {}
+    def keep(task: FitTask, row: dict[str, Any]) -> None:
+        rows[task.name] = {**row, "key": task.key()}
+        write_json(task.row_file, rows[task.name])
 
-    def rows(
-        self,
-        tasks: Sequence[FitTask],
-        keys: Sequence[dict[str, Any]],
-        memory: Sequence[int | None] | None = None,
-    ) -> list[dict[str, Any]]:
-        """The row of each task, in order; see ``finished_runs``.
-
-        Args:
-            tasks: what there is to do.
-            keys: all that each task's result depends on.
-            memory: bytes that each takes, where that is known.
-
-        Raises:
-            IgsrError: a task fails; the message names it.
-        """
-        instruction_set = _core.backend_info(self._backend)["instruction_set"]
-        runs = [
-            Run(
-                task.name,
-                task,
-                {**key, "instruction_set": instruction_set},
-                leaves=task.folder / SPLATS,
-                memory=None if memory is None else memory[number],
-            )
-            for number, (task, key) in enumerate(zip(tasks, keys, strict=True))
-        ]
-        self._all += [(task.name, task.folder) for task in tasks]
-
-        def on_run(done: int, of: int, row: dict[str, Any]) -> None:
-            self._done.add(row["name"])
-
-        looking = (
-            contextlib.nullcontext()
-            if self._told is None
-            else watched(self._all, lambda: self._done, self._told)
-        )
-        with looking:
-            rows = finished_runs(
-                self._folder,
-                runs,
-                do_task if self._ray is not None else in_own_process,
-                self._capture,
-                1,
-                on_run,
-                self._ray or False,
-                again=self._with_less,
+    if missing and ray is not None:
+        shared = missing[0].folder.parent.resolve()
+        shared.mkdir(parents=True, exist_ok=True)
+        with RayCluster(ray) as cluster, _reported(stage, tasks, rows, progress):
+            cluster.check(shared)
+            cluster.run(
+                run_task,
+                missing,
+                keep,
+                memory=lambda task: task.memory,
                 spread=True,
-                shared=self._shared(),
+                retry=_for_retry,
             )
-        self._done |= {task.name for task in tasks}
-        self._tell_of_other_bits(instruction_set, rows)
-        return rows
-
-    def _shared(self) -> Path:
-        """The folder that workers write to, which all machines must see."""
-        self._folder.mkdir(parents=True, exist_ok=True)
-        return self._folder.resolve()
-
-    def _with_less(self, run: Run, error: Exception) -> FitTask:
-        """The task again, after its process ended without a result or memory ran out.
-
-        First as it was, from its checkpoint: any process may be killed. Then with fewer splats.
-
-        Raises:
-            IgsrError: that has been tried; the message names the task.
-        """
-        task = cast(FitTask, run.what)
-        if not isinstance(error, MemoryError) and task.name not in self._lost:
-            self._lost.add(task.name)
-            warnings.warn(f"{task.name} was lost and is begun again: {error}", stacklevel=2)
-            return task
-        self._less[task.name] = self._less.get(task.name, 0) + 1
-        if self._less[task.name] > LESS_OFTEN:
-            raise IgsrError(
-                f"{task.name} ({len(task.shots)} photos) ran out of memory, with fewer splats too: "
-                "give a smaller --max-size or more --blocks."
-            ) from error
-        part = LESS ** self._less[task.name]
-        warnings.warn(
-            f"{task.name} ran out of memory; it is fitted again with {part:g} of the splats.",
-            stacklevel=2,
+    else:
+        for task in missing:
+            with _reported(stage, tasks, rows, progress):
+                keep(task, _run_in_process(task))
+    instruction_set = _core.backend_info(tasks[0].backend)["instruction_set"]
+    hosts = {row["host"] for row in rows.values() if row["instruction_set"] != instruction_set}
+    if hosts:
+        warn_user(
+            f"{', '.join(sorted(hosts))}: the instruction set is not {instruction_set}; the same "
+            "run on other machines may give other bits."
         )
-        return replace(task, splats_part=part)
+    return [rows[task.name] for task in tasks]
 
-    @staticmethod
-    def _tell_of_other_bits(instruction_set: str, rows: Sequence[dict[str, Any]]) -> None:
-        others = sorted({row["host"] for row in rows if row["instruction_set"] != instruction_set})
-        if others:
-            warnings.warn(
-                f"{', '.join(others)}: another instruction set than {instruction_set}; the same "
-                "run elsewhere may end with other bits.",
-                stacklevel=3,
-            )
 
-    def forget_checkpoints(self) -> None:
-        """Remove what only an interrupted run needs."""
-        for _, folder in self._all:
-            for name in (CHECKPOINT, PROGRESS):
-                with contextlib.suppress(OSError):
-                    (folder / name).unlink()
+def _run_in_process(task: FitTask) -> dict[str, Any]:
+    while True:
+        try:
+            return in_a_process(run_task, task)
+        except (WorkerLostError, MemoryError) as error:
+            task = _for_retry(task, error)
+
+
+def _for_retry(task: FitTask, error: Exception) -> FitTask:
+    """The task for the next attempt; it has fewer splats, except after the first lost process."""
+    if not isinstance(error, MemoryError) and not task.was_lost:
+        warn_user(f"{task.name} was lost and is started again: {error}")
+        return replace(task, was_lost=True)
+    part = RETRY_FRACTION * task.splats_part
+    if part < MIN_SPLATS_PART:
+        raise IgsrError(
+            f"{task.name} ({len(task.shots)} photos) ran out of memory, with fewer splats too: "
+            "give a smaller --max-size or more --blocks."
+        ) from error
+    warn_user(f"{task.name} ran out of memory; it is fitted again with {part:g} of the splats.")
+    return replace(task, splats_part=part)
+
+
+@contextlib.contextmanager
+def _reported(
+    stage: str, tasks: Sequence[FitTask], finished: dict[str, Any], progress: Listener | None
+) -> Iterator[None]:
+    """Report progress from a thread; raise the listener's exception at the end."""
+    if progress is None:
+        yield
+        return
+    ended = threading.Event()
+
+    def report_until_end() -> None:
+        while True:
+            was_last = ended.wait(REPORT_INTERVAL_S)
+            progress(_event(stage, tasks, finished))
+            if was_last:
+                return
+
+    with ThreadPoolExecutor(1) as pool:
+        reports = pool.submit(report_until_end)
+        try:
+            yield
+        finally:
+            ended.set()
+    reports.result()
+
+
+def _event(stage: str, tasks: Sequence[FitTask], finished: dict[str, Any]) -> Event:
+    """Progress of tasks, from the files that their workers write."""
+    parts = {
+        task.name: 1.0 if task.name in finished else read_progress(task.folder).get("work", 0.0)
+        for task in tasks
+    }
+    running = [f"{name} {part:.0%}" for name, part in parts.items() if 0.0 < part < 1.0]
+    return Event(stage, sum(parts.values()), len(tasks), ", ".join(running), values=parts)
+
+
+def remove_checkpoints(tasks: Sequence[FitTask]) -> None:
+    """Remove files that only an interrupted run needs."""
+    for task in tasks:
+        for name in (CHECKPOINT_FILE, PROGRESS_FILE):
+            with contextlib.suppress(OSError):
+                (task.folder / name).unlink()

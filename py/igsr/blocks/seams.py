@@ -1,109 +1,109 @@
-"""Whether seams between blocks show: photos across them, by the joined scene and by the blocks."""
+"""Seams between blocks: whether they are visible, and a fit of the splats near them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from igsr._internal.choices import Backend
-from igsr.blocks.manifest import Manifest
-from igsr.blocks.photo_parts import Box, cut_out
-from igsr.capture import View
-from igsr.capture.exposure import Exposure
-from igsr.capture.photos import DescribedCapture
-from igsr.evaluation.scores import score_views
-from igsr.fitting.fitter import without_exposures
-from igsr.splats import Splats
+from igsr.blocks.crops import cropped
+from igsr.blocks.plan import BlockPlan
+from igsr.blocks.tasks import SPLATS_FILE, Context, FitTask, Region, load_splats, save_splats
+from igsr.blocks.visibility import visible_boxes
+from igsr.evaluation.scores import BLACK, WHITE, score_views
+from igsr.fitting.fingerprint import hash_of
+from igsr.fitting.fitter import splat_arrays, without_exposures
+from igsr.splats import Splats, joined, subset
 
-#: Photos that are held in memory at a time while they are scored.
-AT_A_TIME = 8
-#: Seams are visible where photos across them lose more than this by joining, dB in the mean.
-VISIBLE = 0.2
-
-
-def loaded_in_parts(
-    manifest: Manifest,
-    photos: Sequence[int],
-    max_size: int | None,
-    exposures: Mapping[str, Exposure],
-    *,
-    as_taken: bool = False,
-) -> Iterator[list[View]]:
-    """Decode photos of a capture, a few at a time.
-
-    Args:
-        manifest: the capture's photos.
-        photos: their numbers in it.
-        max_size: longest side in pixels of photos as loaded, or None.
-        exposures: of photos, by name.
-        as_taken: photos keep the exposures that are known, and views tell them; else they have the
-            scene's colors.
-
-    Raises:
-        IgsrError: a photo cannot be decoded.
-    """
-    for first in range(0, len(photos), AT_A_TIME):
-        shots = [manifest.shots[index] for index in photos[first : first + AT_A_TIME]]
-        described = DescribedCapture(manifest.path, shots, lambda: None)
-        views = described.loaded(max_size).views
-        known = [exposures.get(view.name) for view in views]
-        if as_taken:
-            yield [replace(v, exposure=one) for v, one in zip(views, known, strict=True)]
-        else:
-            yield without_exposures(views, known)
+#: Seams are visible if photos across them lose more than this by joining (mean PSNR, dB).
+VISIBLE_LOSS_DB = 0.2
+#: Steps of a seam fit, the last ones of a schedule.
+SEAM_FIT_STEPS = 400
 
 
 def seam_scores(
-    own: Sequence[Mapping[str, float]], by_joined: Sequence[Mapping[str, float]]
+    context: Context, splats: Splats, tasks: Sequence[FitTask], rows: Sequence[Mapping[str, Any]]
 ) -> dict[str, Any] | None:
-    """What parts of photos across seams lose by joining; None where there are none.
+    """Mean PSNR in dB of the blocks' crops across seams, by the joined scene and by blocks alone.
 
-    Args:
-        own: of each block, the PSNR in dB of its parts of photos across seams, by its splats before
-            those beyond its cell were left out, with the coarse splats around them.
-        by_joined: of each block, the PSNR of the same parts by the joined scene.
+    None if no photo shows a seam.
     """
-    alone = [psnr for scores in own for psnr in scores.values()]
+    alone = {
+        (task.name, name): psnr
+        for task, row in zip(tasks, rows, strict=True)
+        for name, psnr in row["across"].items()
+    }
     if not alone:
         return None
-    joined = [found[name] for scores, found in zip(own, by_joined, strict=True) for name in scores]
-    loss = float(np.mean(alone) - np.mean(joined))
+    names = {name for _, name in alone}
+    photos = [i for i, shot in enumerate(context.manifest.shots) if shot.name in names]
+    has_alpha = context.manifest.has_alpha(photos)
+    background = context.options.background or (WHITE if has_alpha else BLACK)
+    in_joined = {}
+    for views in context.loaded(photos):
+        for task in tasks:
+            some = [view for view in views if (task.name, view.name) in alone]
+            crops = [cropped(view, task.boxes[view.name]) for view in some]
+            crops = without_exposures(crops, [task.exposures.get(view.name) for view in some])
+            for scored in score_views(splats, crops, background, task.backend, ("psnr",)):
+                in_joined[task.name, scored.name] = scored.scores["psnr"] or 0.0
+    psnr_alone = float(np.mean(list(alone.values())))
+    psnr_joined = float(np.mean([in_joined[key] for key in alone]))
     return {
-        "photos": len({name for scores in own for name in scores}),
+        "photos": len(names),
         "parts": len(alone),
-        "psnr_joined": round(float(np.mean(joined)), 3),
-        "psnr_alone": round(float(np.mean(alone)), 3),
-        "loss_db": round(loss, 3),
-        "visible": loss > VISIBLE,
+        "psnr_joined": round(psnr_joined, 3),
+        "psnr_alone": round(psnr_alone, 3),
+        "loss_db": round(psnr_alone - psnr_joined, 3),
+        "visible": psnr_alone - psnr_joined > VISIBLE_LOSS_DB,
     }
 
 
-def psnr_of_parts(
-    splats: Splats,
-    loaded: Iterator[list[View]],
-    boxes: Sequence[Mapping[str, Box]],
-    background: Sequence[float],
-    backend: Backend,
-) -> list[dict[str, float]]:
-    """PSNR in dB of the parts of photos that blocks have.
+def seam_task(context: Context, plan: BlockPlan, splats: Splats) -> FitTask | None:
+    """Make a short fit of the splats near seams; None if no photo shows any.
 
-    Args:
-        splats: the scene.
-        loaded: the photos, some at a time.
-        boxes: of each block, the parts by the photo's name.
-        background: RGB in [0, 1] behind splats.
-        backend: "cpu" or "gpu".
-
-    Returns:
-        Of each block, by name.
+    It has at most as many pixels as the largest block, so that it needs no more memory.
     """
-    found: list[dict[str, float]] = [{} for _ in boxes]
-    for views in loaded:
-        for scores, box in zip(found, boxes, strict=True):
-            parts = [cut_out(view, box[view.name]) for view in views if view.name in box]
-            for one in score_views(splats, parts, background, backend, ("psnr",)):
-                scores[one.name] = float(one.scores["psnr"] or 0.0)
-    return found
+    scene = context.out / "blocks" / "joined" / SPLATS_FILE
+    scene_hash = hash_of(splat_arrays(splats).values())
+    region = Region(scene, scene_hash, plan.grid, None)
+    near = region.trainable(splats)
+    photos: list[int] = np.flatnonzero(plan.across & plan.photos.any(axis=1)).tolist()
+    if not photos or not near.any() or near.all():
+        return None
+    found = visible_boxes(
+        splats,
+        [context.manifest.shots[index].camera for index in photos],
+        near[:, None],
+        wanted=np.ones((len(photos), 1), np.bool_),
+        background_groups=np.full(len(photos), -1),
+        backend=context.options.backend,
+    )
+    boxes = [by_group[0] for by_group in found]
+    area = sum(box.area for box in boxes)
+    if area > plan.largest_area:
+        count = max(1, int(len(photos) * plan.largest_area / area))
+        chosen = np.linspace(0, len(photos) - 1, count).round().astype(np.int64)
+        photos = [photos[index] for index in chosen]
+        boxes = [boxes[index] for index in chosen]
+    save_splats(scene, splats)
+    kept = ("quality", "seed", "background")
+    settings = {k: v for k, v in context.options.settings.items() if k in kept}
+    settings |= {
+        "steps": SEAM_FIT_STEPS,
+        "density": "fixed",
+        "exposure": "off",
+        "transients": "off",
+        "remove_floaters": False,
+        "coarse_to_fine": False,
+    }
+    by_name = dict(zip(context.names(photos), boxes, strict=True))
+    return context.task("seams", photos, by_name, settings=settings, region=region)
+
+
+def with_seam_fit(splats: Splats, task: FitTask) -> Splats:
+    """The scene with its splats near seams replaced by the fitted ones."""
+    assert task.region is not None
+    near = task.region.trainable(splats)
+    return joined([subset(splats, ~near), load_splats(task.folder / SPLATS_FILE)])

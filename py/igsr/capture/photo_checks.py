@@ -7,13 +7,13 @@ else are excluded when cameras are found: they are not registered.
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import PurePosixPath
 
 import numpy as np
 import numpy.typing as npt
 
+from igsr._internal.user_warning import warn_user
 from igsr.capture.downscaling import plane_area_means, reduced_size
 from igsr.capture.photo_folder import Photo, listed
 from igsr.capture.sharpness import blur, blurred_photos
@@ -192,8 +192,7 @@ def check_photos(views: list[View]) -> None:
 
 
 def _warn(sentence: str) -> None:
-    # To the caller of ``fit``.
-    warnings.warn(sentence, stacklevel=5)
+    warn_user(sentence)
 
 
 def _is_empty(view: View) -> bool:

@@ -24,6 +24,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from igsr._internal.user_warning import warn_user
 from igsr.capture.downscaling import area_means, check_max_size, reduced_size
 from igsr.capture.exif import TURNED, Exif, read_exif, turned_back, upright
 from igsr.capture.image_files import SUFFIXES, decoded, is_file, mask_of, open_image, photo_header
@@ -150,7 +151,7 @@ def load_photos(path: Paths, frames: int = FRAMES, max_size: int | None = None) 
                 f"{len(errors)} of {len(files)} photos are left out: {errors[0]}; so are "
                 f"{listed(broken[1:])}"
             )
-        warnings.warn(message, stacklevel=2)
+        warn_user(message)
     return photos
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+from igsr._internal.choices import FitBackend
 from igsr.cli.output import (
     output_console,
     parts_line,
@@ -29,21 +30,21 @@ def fit_blocks(
     background: tuple[float, float, float] | None,
     as_json: bool,
 ) -> None:
-    """Fit in blocks, with a bar for each.
+    """Fit in blocks and print the report.
 
     Args:
         capture: photos with cameras.
         out: folder of the run.
         blocks: "auto" or a number.
         ray: address of a Ray cluster, or None.
-        settings, holdout, max_size, backend, background: as ``igsr.fit``.
-        as_json: print the report as JSON.
+        settings, holdout, max_size, backend, background: as for ``igsr.fit``.
+        as_json: whether to print the report as JSON.
 
     Raises:
         IgsrError: as ``fit_in_blocks``, or ``blocks`` is not a number.
     """
+    from igsr._internal.progress_bar import progress_bar
     from igsr.blocks import BlockOptions, fit_in_blocks
-    from igsr.blocks.progress import bars
     from igsr.fitting.fitter import check_fits
     from igsr.fitting.presets import default_max_size
 
@@ -57,11 +58,11 @@ def fit_blocks(
         ray=ray,
         holdout=holdout,
         max_size=max_size or default_max_size(name, settings["quality"]),
-        backend=name,
+        backend=cast(FitBackend, name),
         settings={key: value for key, value in settings.items() if value is not None},
         background=background,
     )
-    with bars(shown=not as_json) as show:
+    with progress_bar(shown=not as_json) as show:
         _, report = fit_in_blocks(capture, out, options, show)
     if as_json:
         print_json(report)
@@ -79,8 +80,8 @@ def fit_blocks(
         console.print(f"{across['photos']} of them across seams: PSNR {across['psnr']:.2f} dB")
     if seams:
         console.print(
-            f"seams: {seams['photos']} photos across them score {seams['psnr_joined']:.2f} dB "
-            f"joined, {seams['psnr_alone']:.2f} dB by the block alone"
+            f"seams: {seams['photos']} photos across them have {seams['psnr_joined']:.2f} dB in "
+            f"the joined scene, {seams['psnr_alone']:.2f} dB in single blocks"
         )
     console.print(protocol_line(report["protocol"]), style="dim")
     console.print(parts_line(report["parts"]), style="dim")
@@ -89,11 +90,12 @@ def fit_blocks(
 
 def _block_line(block: dict[str, Any]) -> str:
     if not block["fitted"]:
-        return f"{block['name']}: not fitted, from the coarse fit"
+        return f"{block['name']}: not fitted, splats of the coarse fit"
     peak = block["peak_memory_bytes"]
     memory = "" if peak is None else f", {peak / 2**30:.2f} GiB"
-    less = "" if block["splats_part"] == 1.0 else f", with {block['splats_part']:g} of the splats"
+    part = block["splats_part"]
+    fewer = "" if part == 1.0 else f", with {part:g} of the splats"
     return (
         f"{block['name']}: {block['photos']} photos, {block['splats']} splats, "
-        f"{block['seconds']:.1f} s{memory} on {block['host']}{less}"
+        f"{block['seconds']:.1f} s{memory} on {block['host']}{fewer}"
     )

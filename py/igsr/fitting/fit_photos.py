@@ -121,7 +121,9 @@ def fit(
         holdout: hold out every Nth photo for testing, such as 8.
         max_size: longest side of photos as fitted, pixels; larger ones are reduced. By default
             1000 on the CPU and 1600 on a GPU, times 0.6 or 1.6 for quality "draft" or "high".
-        estimator, estimator_options, frames: how to find cameras; see ``igsr.find_cameras``.
+        estimator: finds cameras if the photos have none, as ``igsr.find_cameras``.
+        estimator_options: of the estimator.
+        frames: maximum number of frames taken from each video.
         allow_missing: continue if cameras of fewer than half of the photos are found.
         resume: continue from the checkpoint in ``out``.
         progress: called with each ``igsr.Event``; an exception ends the fit, after a checkpoint.

@@ -137,16 +137,19 @@ def train(
             "first_step": settings.first_step,
             "frozen_splats": inputs.frozen_count,
         }
-        return fitter_of(
-            views, begin.origin, state, values, inputs.backend, inputs.priors, inputs.exposures
-        )
+        try:
+            return fitter_of(
+                views, begin.origin, state, values, inputs.backend, inputs.priors, inputs.exposures
+            )
+        except ValueError as error:
+            raise IgsrError(f"{error}.") from error
 
     try:
         fitter = fitter_from(begin.state)
-    except ValueError as error:
+    except IgsrError as error:
         if resume and file is not None:
-            raise IgsrError(f"The checkpoint {file.path} cannot be used: {error}.") from error
-        raise IgsrError(f"{error}.") from error
+            raise IgsrError(f"The checkpoint {file.path} cannot be used: {error}") from error
+        raise
 
     looks = steps_to_look(settings, begin.views)
     loop = _Loop(inputs, begin, file, report)
@@ -352,8 +355,8 @@ class _Loop:
         self._saved_step, self._saved_at = int(self.fitter.steps_done), time.perf_counter()
 
     def save_new(self) -> None:
-        """Save a checkpoint if steps were taken since the last one."""
-        if int(self.fitter.steps_done) > (self._saved_step or 0):
+        """Save a checkpoint if steps were taken since the last one, or the fit started over."""
+        if int(self.fitter.steps_done) != self._saved_step:
             self.save()
 
     def finish(self) -> None:

@@ -19,7 +19,7 @@ from igsr.fitting.fitter import fitted_cameras, fitted_exposures, without_exposu
 from igsr.fitting.settings import FitSettings
 from igsr.floaters.photo_evidence import behind_masks
 from igsr.splats import Splats
-from igsr.transients import PLAIN, find_transients
+from igsr.transients import EVIDENT_FRACTION, find_transients
 
 Bool = npt.NDArray[np.bool_]
 #: For each view, bool [H, W], True for pixels that show transient objects; None if none do.
@@ -61,12 +61,12 @@ def look_for_transients(
     cameras = fitted_cameras(views, fitter, origin)
     moved = [replace(view, camera=camera) for view, camera in zip(views, cameras, strict=True)]
     moved = without_exposures(moved, fitted_exposures(views, fitter))
-    must_be_plain = settings.transients == "auto" and not any_masked(masks)
+    must_be_evident = settings.transients == "auto" and not any_masked(masks)
     return find_transients(
         splats,
         moved,
         masks,
-        least=PLAIN if must_be_plain else 0.0,
+        min_evident=EVIDENT_FRACTION if must_be_evident else 0.0,
         background=settings.background or (0.0, 0.0, 0.0),
         backend=backend,
     )

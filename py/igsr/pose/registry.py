@@ -49,7 +49,6 @@ def _colmap(matcher: Matcher | None = None) -> Estimator:
 def _da3(
     checkpoint: str | os.PathLike[str] | None = None,
     cameras: Mapping[str, Camera] | None = None,
-    cameras_from: str = "decoder",
     bundle_adjustment: bool = True,
     matcher: Matcher | None = None,
 ) -> Estimator:
@@ -59,7 +58,6 @@ def _da3(
     return Da3(
         checkpoint=checkpoint,
         cameras=cameras,
-        cameras_from=cameras_from,
         bundle_adjustment=bundle_adjustment,
         matcher=matcher,
     )

@@ -112,7 +112,12 @@ def refine(
         seed: random seed; the result is deterministic for a given seed, backend and instruction
             set.
         backend: "auto" (a real GPU if there is one, else the CPU), "cpu" or "gpu".
-        holdout, max_size, estimator, estimator_options, frames, allow_missing: as ``igsr.fit``.
+        holdout: as ``igsr.fit``.
+        max_size: as ``igsr.fit``.
+        estimator: as ``igsr.fit``.
+        estimator_options: as ``igsr.fit``.
+        frames: as ``igsr.fit``.
+        allow_missing: as ``igsr.fit``.
         resume: continue from the checkpoints in ``out``. Without, checkpoints of an earlier run
             are removed.
         progress: called with each ``igsr.Event``; an exception ends the run, and what is done

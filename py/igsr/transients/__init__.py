@@ -1,5 +1,5 @@
-"""Transient things: what is in one photo and not in the others, such as people and cars."""
+"""Transient objects: in one photo and in no other, such as people and cars."""
 
-from igsr.transients.detection import PLAIN, find_transients
+from igsr.transients.detection import EVIDENT_FRACTION, find_transients
 
-__all__ = ["PLAIN", "find_transients"]
+__all__ = ["EVIDENT_FRACTION", "find_transients"]

@@ -1,39 +1,41 @@
-"""Connected regions of pixels."""
+"""Sums and extremes in windows of pixels, and connected regions."""
 
 from __future__ import annotations
 
-from typing import Any
+import functools
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
+Array: TypeAlias = npt.NDArray[Any]
 Bool = npt.NDArray[np.bool_]
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 
-def dilated(mask: Bool, by: int) -> Bool:
-    """The mask [H, W] grown by ``by`` pixels in all eight directions."""
-    out = mask.copy()
-    for _ in range(by):
-        rows = out.copy()
-        rows[1:] |= out[:-1]
-        rows[:-1] |= out[1:]
-        out = rows.copy()
-        out[:, 1:] |= rows[:, :-1]
-        out[:, :-1] |= rows[:, 1:]
-    return out
+def window_min(values: Array, radius: int) -> Array:
+    """Minimum of values [H, W, ...] within ``radius`` rows and columns of each pixel."""
+    return _window_extreme(np.minimum, values, radius)
 
 
-def eroded(mask: Bool, by: int) -> Bool:
-    """The mask [H, W] shrunk by ``by`` pixels; what is beyond the picture counts as within."""
-    return ~dilated(~mask, by)
+def window_max(values: Array, radius: int) -> Array:
+    """Maximum of values [H, W, ...] within ``radius`` rows and columns of each pixel."""
+    return _window_extreme(np.maximum, values, radius)
 
 
-def box_sums(values: npt.NDArray[Any], half: int) -> Float64:
-    """The sum of values [H, W, ...] within ``half`` rows and columns of each pixel; same shape."""
-    side, around = 2 * half + 1, [(0, 0)] * (values.ndim - 2)
-    sums = np.pad(values.astype(np.float64), [(half + 1, half)] * 2 + around)
+def _window_extreme(extreme: np.ufunc, values: Array, radius: int) -> Array:
+    for _ in range(2):
+        padded = np.pad(values, [(radius, radius)] + [(0, 0)] * (values.ndim - 1), mode="edge")
+        shifted = (padded[shift : shift + len(values)] for shift in range(2 * radius + 1))
+        values = functools.reduce(extreme, shifted).swapaxes(0, 1)
+    return values
+
+
+def box_sums(values: Array, radius: int) -> Float64:
+    """Sums of values [H, W, ...] within ``radius`` rows and columns of each pixel; same shape."""
+    side, rest = 2 * radius + 1, [(0, 0)] * (values.ndim - 2)
+    sums = np.pad(values.astype(np.float64), [(radius + 1, radius)] * 2 + rest)
     sums = sums.cumsum(axis=0).cumsum(axis=1)
     return np.asarray(
         sums[side:, side:] - sums[:-side, side:] - sums[side:, :-side] + sums[:-side, :-side]
@@ -41,24 +43,15 @@ def box_sums(values: npt.NDArray[Any], half: int) -> Float64:
 
 
 def labels(mask: Bool) -> Int64:
-    """A number for each connected region (eight neighbours) [H, W], from 1; 0 outside."""
-    height, width = mask.shape
-    # Each pixel has the largest number of its region in the end: that of its last pixel.
-    number = np.where(mask, np.arange(1, mask.size + 1).reshape(height, width), 0)
+    """Number the connected regions (eight neighbors) of a mask [H, W] from 1; 0 elsewhere."""
+    # Each pixel ends with the largest index in its region, plus 1.
+    number = np.where(mask, np.arange(1, mask.size + 1).reshape(mask.shape), 0)
     while True:
-        padded = np.pad(number, 1)
-        most = number
-        for dy in (0, 1, 2):
-            for dx in (0, 1, 2):
-                most = np.maximum(most, padded[dy : dy + height, dx : dx + width])
-        most = np.where(mask, most, 0)
-        # Follow numbers to the numbers of their pixels: regions are done in few rounds.
-        inside = most > 0
-        flat = most.reshape(-1)
-        most = np.where(inside, flat[np.maximum(most, 1) - 1], 0)
-        if np.array_equal(most, number):
+        largest = np.where(mask, window_max(number, 1), 0)
+        # Jump to the number of the pixel with that index, which takes few iterations.
+        largest = np.where(mask, largest.reshape(-1)[np.maximum(largest, 1) - 1], 0)
+        if np.array_equal(largest, number):
             break
-        number = most
-    _, compact = np.unique(number, return_inverse=True)
-    out = compact.reshape(height, width).astype(np.int64)
-    return out if not mask.all() else out + 1
+        number = largest
+    _, compact = np.unique(np.append(0, number), return_inverse=True)
+    return np.asarray(compact[1:].reshape(mask.shape), np.int64)

@@ -20,7 +20,6 @@ import time
 from collections.abc import Callable
 from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass
-from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -149,7 +148,11 @@ def synthesize(
             on_scene(len(rows), scenes, row)
 
     if ray and missing:
-        _make_over_ray(folder, seed, settings, missing, keep)
+        folder.mkdir(parents=True, exist_ok=True)
+        shared = folder.resolve()
+        with RayCluster() as cluster:
+            cluster.check(shared)
+            cluster.run(lambda index: make_scene(shared, seed, index, settings), missing, keep)
     elif jobs == 1 or len(missing) == 1:
         for index in missing:
             keep(index, make_scene(folder, seed, index, settings))
@@ -170,31 +173,6 @@ def synthesize(
         "settings": asdict(settings),
         "scenes": [rows[index] for index in sorted(rows)],
     }
-
-
-def _make_over_ray(
-    folder: Path,
-    seed: int,
-    settings: CaptureSettings,
-    indices: list[int],
-    keep: Callable[[int, dict[str, Any]], None],
-) -> None:
-    """``keep`` is called with each scene as it is made, the others' of one that fails, too."""
-    folder.mkdir(parents=True, exist_ok=True)
-    make = partial(_make_named, seed, settings)
-    with RayCluster() as cluster:
-        cluster.check(folder.resolve())
-        cluster.do(
-            make,
-            str(folder.resolve()),
-            indices,
-            lambda number, row: keep(indices[number], row),
-        )
-
-
-def _make_named(seed: int, settings: CaptureSettings, folder: str, index: int) -> dict[str, Any]:
-    """``make_scene``, in the order in which work for a cluster is called."""
-    return make_scene(Path(folder), seed, index, settings)
 
 
 def is_made(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import tempfile
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from igsr._internal.load_pycolmap import load_pycolmap
+from igsr._internal.user_warning import warn_user
 from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
 from igsr.pose.colmap.attempts import mapped
@@ -61,10 +61,9 @@ class Colmap:
         if len(photos) > MANY_PHOTOS:
             sizes = [(photo.image.shape[1], photo.image.shape[0]) for photo in photos]
             minutes = camera_seconds(sizes) / 60.0
-            warnings.warn(
+            warn_user(
                 f"COLMAP needs about {minutes:.0f} minutes for {len(photos)} photos; every third "
-                "photo is usually enough",
-                stacklevel=2,
+                "photo is usually enough"
             )
         with tempfile.TemporaryDirectory(prefix="igsr-colmap-") as folder, guarded(seed):
             workspace = Path(folder)

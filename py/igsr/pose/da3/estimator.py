@@ -18,7 +18,7 @@ from igsr.pose.checkpoint_search import find_checkpoint
 from igsr.pose.colmap.matcher import Matcher, checked_matcher
 from igsr.pose.da3.checkpoint import LICENSE, SIZES, load_network
 from igsr.pose.da3.passes import joined_passes, passes_of
-from igsr.pose.da3.prediction import SOURCES, Da3Predictor, Predictor
+from igsr.pose.da3.prediction import Da3Predictor, Predictor
 from igsr.pose.depth_maps import (
     AlignedPhoto,
     confident_pixels,
@@ -47,8 +47,6 @@ class Da3:
         checkpoint: safetensors file with the network's weights, or its folder; by default it is
             searched for.
         cameras: known cameras of all photos by name, which are kept: only depths are estimated.
-        cameras_from: "decoder", the network's prediction of cameras, or "rays", the best fit to
-            its rays of pixels, which takes longer.
         bundle_adjustment: whether to adjust cameras to features (``igsr.pose.all_evidence``).
         matcher: of these features, as for ``Colmap``.
     """
@@ -60,14 +58,12 @@ class Da3:
         predictor: Predictor | None = None,
         checkpoint: str | os.PathLike[str] | None = None,
         cameras: Mapping[str, Camera] | None = None,
-        cameras_from: str = SOURCES[0],
         bundle_adjustment: bool = True,
         matcher: Matcher | None = None,
     ) -> None:
         self.predictor = predictor
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
         self.cameras = dict(cameras or {})
-        self.cameras_from = cameras_from
         self.bundle_adjustment = bundle_adjustment
         self.matcher = checked_matcher(matcher)
 
@@ -85,7 +81,7 @@ class Da3:
 
         Args:
             photos: at least two.
-            seed: of the samples of rays and the verification of matches.
+            seed: of the verification of matches.
             progress: called as progress("passes", done, total), then with COLMAP's stages.
 
         Raises:
@@ -237,7 +233,7 @@ class Da3:
         network = load_network(path)
         name = next(name for name, size in SIZES.items() if size == network.config)
         weights = {"name": name, "licence": LICENSE, "sha256": sha256_of(path)}
-        return Da3Predictor(network, self.cameras_from), weights
+        return Da3Predictor(network), weights
 
 
 def with_shared_focals(

@@ -20,7 +20,7 @@ from igsr.capture.memory_check import available_memory
 from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
 from igsr.pose.da3.backbone import PATCH, NetworkConfig
-from igsr.pose.da3.cameras import cameras_of_rays, decode_pose
+from igsr.pose.da3.cameras import decode_pose
 from igsr.pose.da3.network import Da3Network, ViewPrediction
 from igsr.pose.depth_maps import AlignedPhoto
 from igsr.pose.grid import Grid, on_white
@@ -52,8 +52,6 @@ MIN_FOCAL = 0.2
 MAX_FOCAL = 10.0
 #: Confidence of pixels that must not be used.
 NO_CONFIDENCE = 1.0
-#: Sources of cameras; the first is the default.
-SOURCES = ("decoder", "rays")
 
 
 @dataclass(frozen=True)
@@ -206,11 +204,8 @@ class Da3Predictor:
     float32.
     """
 
-    def __init__(self, network: Da3Network, cameras_from: str = SOURCES[0]) -> None:
-        if cameras_from not in SOURCES:
-            raise IgsrError(f"cameras_from is {cameras_from!r}; give {' or '.join(SOURCES)}")
+    def __init__(self, network: Da3Network) -> None:
         self.network = network
-        self.cameras_from = cameras_from
         self.device = next(network.parameters()).device
 
     def most_photos(self, photos: Sequence[Photo]) -> int:
@@ -247,16 +242,14 @@ class Da3Predictor:
             viewmats = torch.from_numpy(np.stack([camera.viewmat for camera in cameras]))
             intrinsics = torch.from_numpy(np.stack([one.intrinsics(c.K) for one, c in pairs]))
         with torch.inference_mode(), half_precision(self.device):
-            views = self.network.predict(
-                inputs, viewmats, intrinsics, rays=self.cameras_from == "rays"
-            )
+            views = self.network.predict(inputs, viewmats, intrinsics, rays=False)
         return [
-            self._aligned(photo, one, view, seed)
+            self._aligned(photo, one, view)
             for photo, one, view in zip(photos, resamplings, views, strict=True)
         ]
 
     def _aligned(
-        self, photo: Photo, resampling: Resampling, view: ViewPrediction, seed: int
+        self, photo: Photo, resampling: Resampling, view: ViewPrediction
     ) -> AlignedPhoto | None:
         depth, confidence = float32_array(view.depth), float32_array(view.confidence)
         encoding = float32_array(view.pose_encoding)
@@ -266,15 +259,7 @@ class Da3Predictor:
                 "download it again"
             )
         size = resampling.height, resampling.width
-        if view.rays is not None and view.ray_confidence is not None:
-            try:
-                w2c, K = cameras_of_rays(
-                    view.rays[None], view.ray_confidence[None], *size, seed=seed
-                )
-            except IgsrError:
-                return None
-        else:
-            w2c, K = decode_pose(encoding[None], *size)
+        w2c, K = decode_pose(encoding[None], *size)
         height, width = photo.image.shape[:2]
         grid = resampling.grid()
         in_photo = np.diag([grid.scale_x, grid.scale_y, 1.0]) @ K[0]
