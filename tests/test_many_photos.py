@@ -1,4 +1,4 @@
-"""Refinements of many photos: bounded memory, and an early end where nothing is open."""
+"""Refinements of many photos: bounded memory, and no round if photos overlap enough."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from refinements import refine, truthful
 
-from igsr.refinement import loop, near_sources
+from igsr.fitting.photo_statistics import photo_statistics
+from igsr.refinement import near_sources, refine_photos
 from igsr.refinement.near_sources import NearSources
-from igsr.refinement.results import Stop, StopReason
+from igsr.refinement.results import StopReason
 
 
 def test_the_nearest_photos_are_held_and_no_more(ball_photos, helped, monkeypatch):
@@ -39,27 +40,25 @@ def test_the_nearest_photos_are_held_and_no_more(ball_photos, helped, monkeypatc
     assert len(made) == again, "a held one is not"
 
 
-def test_all_photos_are_near_where_there_are_few(ball_photos, helped):
+def test_all_of_few_photos_are_near(ball_photos, helped):
     photos = ball_photos.train_views
     sources = NearSources(helped[0].first, photos, (1.0, 1.0, 1.0), "cpu")
     near = sources.of(photos[4].camera)
     assert [one.camera for one in near] == [photo.camera for photo in photos]
 
 
-def test_a_refinement_ends_where_photos_leave_nothing_open(ball_photos, monkeypatch):
-    monkeypatch.setattr(loop, "ENOUGH_PHOTOS", 2.0)
+def test_auto_does_no_round_if_many_photos_see_the_same_place(ball_photos, monkeypatch):
+    monkeypatch.setattr(refine_photos, "ENOUGH_PHOTOS", 2.0)
     refined = refine(ball_photos, "auto", truthful, steps=20)
     assert refined.stop.reason is StopReason.ENOUGH_PHOTOS
     assert refined.rounds == []
-    assert "photos see the same place" in str(refined.stop)
+    assert "every point is seen by" in str(refined.stop)
     assert "cross_validate" not in refined.seconds
-    # Rounds that were asked for are done.
     asked = refine(ball_photos, 1, truthful, steps=20)
-    assert len(asked.rounds) == 1 or asked.stop != Stop(StopReason.ENOUGH_PHOTOS, 2)
+    assert len(asked.rounds) == 1 or asked.stop.reason is not StopReason.ENOUGH_PHOTOS
 
 
 @pytest.mark.parametrize("count", [1, 9])
-def test_the_default_end_is_for_more_photos_than_a_ring_has(ball_photos, count):
-    from igsr.fitting.photo_statistics import photo_statistics
-
-    assert photo_statistics(ball_photos.train_views[:count]).seen_by < loop.ENOUGH_PHOTOS
+def test_a_ring_of_few_photos_gets_rounds(ball_photos, count):
+    photos = ball_photos.train_views[:count]
+    assert photo_statistics(photos).overlap < refine_photos.ENOUGH_PHOTOS

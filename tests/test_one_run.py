@@ -14,7 +14,7 @@ import scenes
 from PIL import Image, ImageFile
 
 import igsr
-from igsr._internal import part_usage
+from igsr._internal.part_usage import Meter, Usage
 from igsr.capture.image_files import SUFFIXES
 from igsr.denoiser import save_network
 from igsr.denoiser.network import Architecture, DenoiserNetwork
@@ -74,9 +74,7 @@ def test_python_and_the_command_leave_the_same_files(
     photos, command, denoiser, tmp_path, igsr_here, monkeypatch
 ):
     # Without clocks and memory, all files have the same bytes.
-    monkeypatch.setattr(part_usage, "time", SimpleNamespace(monotonic=lambda: 0.0))
-    monkeypatch.setattr(part_usage, "cpu_seconds", lambda: 0.0)
-    monkeypatch.setattr(part_usage, "peak_bytes", lambda: 1)
+    monkeypatch.setattr(Meter, "lap", lambda meter: Usage(0.0, 0.0, 1))
     monkeypatch.setattr(train, "time", SimpleNamespace(perf_counter=lambda: 0.0))
     by_python, by_command = tmp_path / "python/out", tmp_path / "command/out"
     run(command, photos, by_python, denoiser)
