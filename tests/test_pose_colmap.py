@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -22,7 +23,7 @@ from igsr.capture.write_transforms import write_transforms
 from igsr.geometry.pose_errors import pose_accuracy
 from igsr.geometry.similarity import Similarity, similarity_between
 from igsr.pose import registry
-from igsr.pose.colmap import Colmap, estimator, pairs
+from igsr.pose.colmap import Colmap, estimator, features, pairs
 from igsr.pose.colmap.attempts import Mapped
 from igsr.pose.colmap.database import list_photos
 from igsr.pose.colmap.features import find_features
@@ -95,6 +96,17 @@ def test_the_same_seed_gives_the_same_bits_without_output(
         assert steps == sorted(steps)
         assert steps[-1][0] == steps[-1][1]
     assert capfd.readouterr() == ("", "")
+
+
+def test_several_processes_find_the_same_features(photos, found, monkeypatch) -> None:
+    monkeypatch.setattr(features, "MIN_PARALLEL_PX", 0)
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    again = Colmap()(photos, seed=3)
+    assert matrices(again.cameras) == matrices(found.cameras)
+    np.testing.assert_array_equal(again.points.xyz, found.points.xyz)
+    monkeypatch.setattr(sys, "executable", "/bin/false")
+    with pytest.raises(igsr.IgsrError, match="Finding features ended early"):
+        Colmap()(photos, seed=3)
 
 
 def test_lens_distortion_is_estimated_and_undone() -> None:
