@@ -314,11 +314,9 @@ def test_frozen_splats_do_not_change(halves, tmp_path):
 def test_bad_frozen_splats_are_named(halves, change, message):
     capture, start, frozen = halves
     frozen = subset(frozen, slice(1))
-    given = (
-        {"frozen": frozen}
-        if change is None
-        else {"start": start, "frozen": replace(frozen, **change)}
-    )
+    given = {"frozen": frozen}
+    if change is not None:
+        given = {"start": start, "frozen": replace(frozen, **change)}
     with pytest.raises(igsr.IgsrError, match=message):
         scenes.fit(capture, steps=5, backend="cpu", **given)
 

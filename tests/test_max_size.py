@@ -129,7 +129,7 @@ def test_a_fit_accepts_odd_photos():
     ]
     options = {"steps": 10, "max_splats": 200, "backend": "cpu", "start": "random"}
     with pytest.warns(UserWarning, match=r"black\.png: black or fully transparent"):
-        splats = igsr.fit(replace(capture, views=capture.views + odd), **options)
+        splats = scenes.fit(replace(capture, views=capture.views + odd), **options)
     assert splats.finite.all()
 
 
