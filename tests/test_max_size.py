@@ -11,7 +11,6 @@ import scenes
 from capture_files import HEIGHT, WIDTH, photo, save, write_colmap, write_transforms
 from PIL import Image
 
-import igsr
 from igsr.capture import Camera, View, load_capture
 from igsr.capture.downscaling import (
     area_means,
