@@ -63,6 +63,19 @@ def splats(count=40, degree=1, seed=0, origin=(0.0, 0.0, 0.0)):
     )
 
 
+def round_splats(means, size=0.05, opacity=2.0, color=0.5):
+    """Round splats of one size (standard deviation), opacity (logit) and color."""
+    count = len(means)
+    gray = np.broadcast_to(np.asarray(color), (count, 1, 3))
+    return Splats(
+        means=np.ascontiguousarray(means, np.float32),
+        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+        scales=np.full((count, 3), np.log(size), np.float32),
+        opacities=np.full(count, opacity, np.float32),
+        sh=((gray - 0.5) / 0.28209479177387814).astype(np.float32),
+    )
+
+
 def ring_camera(angle, size=48, distance=4.0, center=(0.0, 0.0, 0.0)):
     """A camera on a ring in the x-z plane, y down, looking at ``center``."""
     back = np.array([np.sin(angle), 0.0, -np.cos(angle)])

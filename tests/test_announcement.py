@@ -80,7 +80,7 @@ def test_cameras_take_longer_for_more_and_larger_photos():
 
 def overview(sizes, **fields):
     usual = {"path": Path("photos"), "has_cameras": True, "train": len(sizes), "channels": 3}
-    return Overview(sizes=sizes, **{**usual, **fields})
+    return Overview(sizes=sizes, **{**usual, "masked": False, **fields})
 
 
 @pytest.fixture

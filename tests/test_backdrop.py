@@ -77,19 +77,12 @@ def test_opaque_scenes_have_the_photos_colors_behind_them():
     camera = scenes.ring_camera(0.0)
     image = np.full((camera.height, camera.width, 3), (200, 100, 50), np.uint8)
     view = igsr.View("wall.png", camera, "train", image)
-    forward = camera.viewmat[2, :3]
-    wall = igsr.Splats(
-        means=(camera.center + 2.0 * forward)[None].astype(np.float32),
-        quats=np.float32([[1.0, 0.0, 0.0, 0.0]]),
-        scales=np.full((1, 3), 2.0, np.float32),
-        opacities=np.float32([9.0]),
-        sh=((np.array([[[200, 100, 50]]]) / 255.0 - 0.5) / 0.28209479).astype(np.float32),
-    )
+    center = camera.center + 2.0 * camera.viewmat[2, :3]
+    color = np.array([200, 100, 50]) / 255.0
+    wall = scenes.round_splats([center], size=np.exp(2.0), opacity=9.0, color=color)
     scene = with_backdrop(wall, [view], "cpu")
     behind = igsr.render(scene, looking_away(camera), backend="cpu")
-    np.testing.assert_allclose(
-        behind.color.reshape(-1, 3).mean(axis=0), np.array([200, 100, 50]) / 255.0, atol=0.02
-    )
+    np.testing.assert_allclose(behind.color.mean(axis=(0, 1)), color, atol=0.02)
 
 
 def test_no_backdrop_over_black():

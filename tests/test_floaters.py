@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import scenes
+from scenes import round_splats
 from typer.testing import CliRunner
 
 import igsr
@@ -23,18 +23,6 @@ BLACK = (0.0, 0.0, 0.0)
 BALL = scenes.splats(60, degree=0)
 
 
-def specks(means, size=0.05, opacity=2.0, color=0.5):
-    """Round splats of one size."""
-    count = len(means)
-    return igsr.Splats(
-        means=np.ascontiguousarray(means, np.float32),
-        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
-        scales=np.full((count, 3), math.log(size), np.float32),
-        opacities=np.full(count, opacity, np.float32),
-        sh=np.full((count, 1, 3), (color - 0.5) / 0.28209479177387814, np.float32),
-    )
-
-
 def before(view, distance=1.2):
     """A place before a view's camera, between it and the ball."""
     camera = view.camera
@@ -43,7 +31,7 @@ def before(view, distance=1.2):
 
 def ball_and(means, **options):
     """The ball, and specks after it."""
-    return joined([BALL, specks(means, **options)])
+    return joined([BALL, round_splats(means, **options)])
 
 
 def photos_of(scene=BALL, views=6, **options):
@@ -190,38 +178,38 @@ def plane(count=20, scale=1.0):
     """A plane of splats that touch each other."""
     grid = np.indices((count, count)).reshape(2, -1).T
     means = np.concatenate([grid, np.zeros((len(grid), 1))], axis=1)
-    return specks(means * 0.1 * scale, size=0.05 * scale)
+    return round_splats(means * 0.1 * scale, size=0.05 * scale)
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
 def test_an_isolated_splat_is_alone(scale):
-    speck = specks([[1.0 * scale, 1.0 * scale, 30.0 * scale]], size=0.05 * scale)
+    speck = round_splats([[1.0 * scale, 1.0 * scale, 30.0 * scale]], size=0.05 * scale)
     found = alone(joined([plane(scale=scale), speck]))
     assert np.flatnonzero(found).tolist() == [400]
 
 
 def test_large_distant_splats_are_not_alone():
-    far = specks([[0.0, 0.0, 30.0], [20.0, 0.0, 30.0]], size=15.0)
+    far = round_splats([[0.0, 0.0, 30.0], [20.0, 0.0, 30.0]], size=15.0)
     assert not alone(joined([plane(), far])).any()
 
 
 def test_extreme_positions_do_not_overflow():
-    hard = joined([plane(), specks([[3e38, -3e38, 0.0]]), specks([[0.0, 0.0, 1.0]], size=1e-30)])
-    hard.scales[400] = 88.0
+    hard = joined([plane(), round_splats([[3e38, -3e38, 0.0], [0.0, 0.0, 1.0]])])
+    hard.scales[400:] = [[88.0], [-69.0]]
     found = alone(hard)
     assert found[401]
     assert not found[:400].any()
 
 
 def test_a_scene_of_isolated_splats_is_kept():
-    lonely = specks([[10.0 * k, 0.0, 0.0] for k in range(30)])
+    lonely = round_splats([[10.0 * k, 0.0, 0.0] for k in range(30)])
     assert alone(lonely).all()
     assert not stray_splats(lonely)["alone"].any()
 
 
 def test_removing_invisible_splats_keeps_renders_identical():
-    model = joined([plane(), specks([[1.0, 1.0, 0.1]], opacity=-5.6), specks([[0.5, 0.5, 0.1]])])
-    model.means[401] = np.nan
+    model = joined([plane(), round_splats([[1.0, 1.0, 0.1], [np.nan] * 3])])
+    model.opacities[400] = -5.6
     cleaned = igsr.remove_floaters(model)
     assert cleaned.removed == {"invisible": 2, "alone": 0}
     assert cleaned.splats == plane()
@@ -236,8 +224,8 @@ def test_removing_invisible_splats_keeps_renders_identical():
 
 def test_removal_by_photos_keeps_the_order():
     capture = scenes.capture(views=8, scene=BALL)
-    floating = specks([before(capture.views[2])], size=0.03, opacity=-1.0)
-    model = joined([specks([[0.0, 40.0, 0.0]]), BALL, floating])
+    floating = round_splats([before(capture.views[2])], size=0.03, opacity=-1.0)
+    model = joined([round_splats([[0.0, 40.0, 0.0]]), BALL, floating])
     origin = np.array([1.0, 0.0, 0.0])
     model = replace(model, origin=origin, means=(model.means - origin).astype(np.float32))
     cleaned = igsr.remove_floaters(model, capture, backend="cpu")
@@ -248,7 +236,7 @@ def test_removal_by_photos_keeps_the_order():
 
 def test_a_scene_of_floaters_only_is_kept():
     capture = scenes.capture(views=4)
-    cleaned = igsr.remove_floaters(specks([[0.0, 40.0, 0.0]]), capture, backend="cpu")
+    cleaned = igsr.remove_floaters(round_splats([[0.0, 40.0, 0.0]]), capture, backend="cpu")
     assert len(cleaned.splats) == 1
     assert cleaned.removed == {"unseen": 0, "masked": 0, "floating": 0}
 
@@ -291,7 +279,7 @@ def command(*arguments):
 def scene(tmp_path):
     """A scene with a speck far away that no photo shows, and its photos."""
     capture = scenes.capture(views=8, scene=BALL)
-    joined([BALL, specks([[0.0, 40.0, 0.0]])]).save(tmp_path / "scene.ply")
+    joined([BALL, round_splats([[0.0, 40.0, 0.0]])]).save(tmp_path / "scene.ply")
     scenes.write_capture(tmp_path / "photos", capture)
     return tmp_path / "scene.ply", tmp_path / "photos"
 
@@ -314,7 +302,7 @@ def test_clean_removes_unseen_splats(scene, tmp_path):
 
 
 def test_clean_without_photos_removes_stray_splats(tmp_path):
-    joined([plane(), specks([[1.0, 1.0, 30.0]])]).save(tmp_path / "scene.ply")
+    joined([plane(), round_splats([[1.0, 1.0, 30.0]])]).save(tmp_path / "scene.ply")
     result = command(tmp_path / "scene.ply")
     assert result.exit_code == 0, result.output
     assert "removed 1 splats: 0 too faint to be drawn, 1 with few neighbors" in result.stdout

@@ -11,7 +11,6 @@ import scenes
 from capture_files import HEIGHT, WIDTH, photo, save, write_colmap, write_transforms
 from PIL import Image
 
-import igsr
 from igsr.capture import Camera, View, load_capture
 from igsr.capture.downscaling import (
     area_means,
@@ -129,7 +128,7 @@ def test_a_fit_accepts_odd_photos():
     ]
     options = {"steps": 10, "max_splats": 200, "backend": "cpu", "start": "random"}
     with pytest.warns(UserWarning, match=r"black\.png: black or fully transparent"):
-        splats = igsr.fit(replace(capture, views=capture.views + odd), **options)
+        splats = scenes.fit(replace(capture, views=capture.views + odd), **options)
     assert splats.finite.all()
 
 

@@ -114,10 +114,10 @@ def test_a_folder_of_screenshots_is_an_error(tmp_path, photos):
     for index in range(4):
         Image.fromarray(screenshot("", index).image).save(tmp_path / f"{index}.png")
     with pytest.raises(IgsrError, match=r"0 is left .*0\.png, 1\.png, 2\.png and 1 more: .*screen"):
-        igsr.estimate_poses(tmp_path, "colmap")
+        igsr.find_cameras(tmp_path)
     Image.fromarray(photos[0].image).save(tmp_path / "photo.png")
-    with pytest.raises(IgsrError, match=r"2 photos at least, and 1 is left"):
-        igsr.estimate_poses(tmp_path, "colmap")
+    with pytest.raises(IgsrError, match=r"at least 2 photos, and 1 is left"):
+        igsr.find_cameras(tmp_path)
 
 
 def test_exif_of_a_screenshot(tmp_path, photos):

@@ -149,7 +149,7 @@ def look_at(
     """Look at a capture, a folder of photos or a video.
 
     Args:
-        path: as for ``igsr.load_capture`` and ``igsr.estimate_poses``.
+        path: as for ``igsr.load_capture`` and ``igsr.find_cameras``.
         frames: maximum number of frames taken from each video.
         max_size: longest side in pixels of photos as they will be loaded, or None; a capture may
             have its photos at several sizes.
