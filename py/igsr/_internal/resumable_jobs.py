@@ -1,11 +1,11 @@
-"""Independent runs, each kept in a file of its own, so that a study resumes where it stopped."""
+"""Independent runs, each kept in its own file, so that a study continues after an interruption."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import as_completed
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,19 +17,22 @@ from igsr._internal.ray_jobs import RayCluster
 from igsr._internal.worker_processes import WorkerLostError, worker_processes
 from igsr.errors import IgsrError
 
+Row = dict[str, Any]
+#: From the data folder and the description of a run to its row.
+Work = Callable[[str, Any], Row]
+
 
 @dataclass(frozen=True)
 class Run:
-    """One run of a study, such as a fit.
+    """One run, such as a fit.
 
     Attributes:
         name: of its file, without ending.
-        what: describes it; what ``work`` is called with.
-        settings: all that its result depends on. A run with other settings is done again.
-        leaves: a file that it leaves beside its row, if any; without that it is not done.
-        scene: its folder in the data; the hash of all its files joins the settings, as "data",
-            since photos and cameras may be corrected. None where the settings say all.
-        memory: bytes that it takes, where that is known: Ray starts no more than fit.
+        what: argument of the function that does the run.
+        settings: everything that the result depends on; a change repeats the run.
+        leaves: a file that it writes, if any; if that is missing, the run is repeated.
+        scene: folder in the data whose files' hash is added to the settings as "data", or None.
+        memory: bytes that it needs, or None; Ray starts no more runs than fit.
     """
 
     name: str
@@ -41,7 +44,7 @@ class Run:
 
 
 def file_hash(path: Path) -> str:
-    """SHA-256 of a file that a run's result depends on, for its settings."""
+    """SHA-256 of a file that a result depends on."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
@@ -57,48 +60,39 @@ def folder_hash(folder: Path) -> str:
 def finished_runs(
     folder: Path,
     runs: list[Run],
-    work: Callable[[str, Any], dict[str, Any]],
+    work: Work,
     data: str,
     jobs: int,
-    on_run: Callable[[int, int, dict[str, Any]], None] | None,
+    on_run: Callable[[int, int, Row], None] | None,
     ray: bool | str = False,
     *,
     again: Callable[[Run, Exception], Any] | None = None,
     spread: bool = False,
     shared: Path | None = None,
-) -> list[dict[str, Any]]:
-    """The row of every run, in order: read where its file is there, else done and written.
-
-    A run is done again if its file is of another version, has other settings (presets and photos
-    change), or if a file that it left is gone. When one run fails, those under way are still
-    finished and kept.
+) -> list[Row]:
+    """Return the row of every run, in order; do the runs whose files are missing or outdated.
 
     Args:
         folder: of the runs' files.
-        runs: what there is to do.
-        work: does one run, given ``data`` and ``Run.what``; returns its row, which JSON can hold.
-        data: folder that holds the scenes.
-        jobs: runs at a time on this machine, each in a process of its own with its share of cores.
-        on_run: called with (done, all, the run's row) after each run.
-        ray: run on the Ray cluster that this machine is part of, or on a local one, as many at a
-            time as it has room for; its machines see ``data`` under the same path. A text is the
-            cluster's address (``igsr._internal.ray_jobs``).
-        again: called with a run and the exception where memory ran out or its process ended without
-            a result; what it returns, if not None, is given to ``work`` once more.
-        spread: over Ray, whether a run takes its share of a machine's cores, not one.
-        shared: over Ray, a folder that all machines must see.
+        runs: the runs.
+        work: called with ``data`` and ``Run.what``; returns the row, as JSON values.
+        data: folder with the scenes.
+        jobs, ray, spread, shared: as ``execute``.
+        on_run: called with (done, total, row) after each run.
+        again: called with a run and the exception if its process was lost or memory ran out;
+            ``work`` is repeated with the returned value, if that is not None.
 
     Raises:
         IgsrError: a run fails, its file cannot be read or written, or Ray is not installed.
     """
-    rows: dict[str, dict[str, Any]] = {}
+    rows: dict[str, Row] = {}
     missing = []
     scenes = {run.scene for run in runs if run.scene is not None}
     hashes = {scene: folder_hash(Path(data) / scene) for scene in scenes}
 
-    def about(run: Run) -> dict[str, Any]:
-        of = {} if run.scene is None else {"data": hashes[run.scene]}
-        return {"igsr": _core.__version__, "settings": run.settings | of}
+    def about(run: Run) -> Row:
+        of_data = {} if run.scene is None else {"data": hashes[run.scene]}
+        return {"igsr": _core.__version__, "settings": run.settings | of_data}
 
     for run in runs:
         row = _read(folder / f"{run.name}.json")
@@ -109,7 +103,8 @@ def finished_runs(
         else:
             missing.append(run)
 
-    def keep(run: Run, row: dict[str, Any]) -> None:
+    def keep(number: int, row: Row) -> None:
+        run = missing[number]
         row = {**row, **about(run)}
         folder.mkdir(parents=True, exist_ok=True)
         with atomic_write(folder / f"{run.name}.json") as temporary:
@@ -118,75 +113,98 @@ def finished_runs(
         if on_run is not None:
             on_run(len(rows), len(runs), row)
 
-    if ray and missing:
-        _over_ray(missing, work, data, keep, ray, again, spread, shared)
-    elif jobs == 1:
-        for run in missing:
-            keep(run, _done(work, data, run, again))
-    elif missing:
-        threads = max(1, (os.cpu_count() or 1) // jobs)
-        with worker_processes(jobs, threads) as pool:
-            pending = {pool.submit(work, data, run.what): run for run in missing}
-            try:
-                for done in as_completed(pending):
-                    keep(pending[done], done.result())
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                for other, run in pending.items():
-                    finished = other.done() and not other.cancelled()
-                    if finished and run.name not in rows and other.exception() is None:
-                        keep(run, other.result())
-                raise
+    execute(
+        work,
+        data,
+        [run.what for run in missing],
+        keep,
+        jobs=jobs,
+        ray=ray,
+        again=None if again is None else lambda number, error: again(missing[number], error),
+        memory=[run.memory for run in missing],
+        spread=spread,
+        shared=shared,
+    )
     return [rows[run.name] for run in runs]
 
 
-def _done(
-    work: Callable[[str, Any], dict[str, Any]],
+def execute(
+    work: Work,
     data: str,
-    run: Run,
-    again: Callable[[Run, Exception], Any] | None,
-) -> dict[str, Any]:
-    """The row of a run, done with what ``again`` makes of it as often as memory runs out."""
-    what = run.what
+    pieces: Sequence[Any],
+    keep: Callable[[int, Row], None],
+    *,
+    jobs: int = 1,
+    ray: bool | str = False,
+    again: Callable[[int, Exception], Any] | None = None,
+    memory: Sequence[int | None] | None = None,
+    spread: bool = False,
+    shared: Path | None = None,
+) -> None:
+    """Do pieces of work here, in several processes, or on a Ray cluster.
+
+    After a failure, pieces that are under way are still finished and kept.
+
+    Args:
+        work: called with ``data`` and a piece; returns its row.
+        data: the first argument.
+        pieces: the second arguments.
+        keep: called with the number of each finished piece and its row.
+        jobs: number of processes, which share the cores.
+        ray: run on the Ray cluster of this machine, or a local one; a text is the address of a
+            cluster (``igsr._internal.ray_jobs``). Its machines see ``data`` at the same path.
+        again: called with the number of a piece and the exception if its process was lost or memory
+            ran out; ``work`` is repeated with the returned value, if that is not None.
+        memory: bytes that each piece needs, on Ray.
+        spread: whether a piece uses its share of a machine's cores on Ray instead of one.
+        shared: a folder that all machines must see, on Ray.
+
+    Raises:
+        IgsrError: a piece fails, or Ray is not installed.
+    """
+    if ray and pieces:
+        with RayCluster(ray if isinstance(ray, str) else None) as cluster:
+            cluster.check(shared)
+            cluster.do(work, data, pieces, keep, memory=memory, spread=spread, again=again)
+    elif jobs == 1:
+        for number, piece in enumerate(pieces):
+            keep(number, _done(work, data, number, piece, again))
+    elif pieces:
+        threads = max(1, (os.cpu_count() or 1) // jobs)
+        with worker_processes(jobs, threads) as pool:
+            pending = {pool.submit(work, data, piece): n for n, piece in enumerate(pieces)}
+            kept = set()
+            try:
+                for done in as_completed(pending):
+                    keep(pending[done], done.result())
+                    kept.add(done)
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                for other, number in pending.items():
+                    finished = other.done() and not other.cancelled()
+                    if finished and other not in kept and other.exception() is None:
+                        keep(number, other.result())
+                raise
+
+
+def _done(
+    work: Work,
+    data: str,
+    number: int,
+    piece: Any,
+    again: Callable[[int, Exception], Any] | None,
+) -> Row:
     while True:
         try:
-            return work(data, what)
+            return work(data, piece)
         except (WorkerLostError, MemoryError) as error:
-            other = None if again is None else again(run, error)
+            other = None if again is None else again(number, error)
             if other is None:
                 raise
-            what = other
+            piece = other
 
 
-def _over_ray(
-    runs: list[Run],
-    work: Callable[[str, Any], dict[str, Any]],
-    data: str,
-    keep: Callable[[Run, dict[str, Any]], None],
-    ray: bool | str,
-    again: Callable[[Run, Exception], Any] | None,
-    spread: bool,
-    shared: Path | None,
-) -> None:
-    """``keep`` is called with each run as it is done; after a failure, those under way are kept."""
-
-    def other(number: int, error: Exception) -> Any:
-        return None if again is None else again(runs[number], error)
-
-    with RayCluster(ray if isinstance(ray, str) else None) as cluster:
-        cluster.check(shared)
-        cluster.do(
-            work,
-            data,
-            [run.what for run in runs],
-            lambda number, row: keep(runs[number], row),
-            memory=[run.memory for run in runs],
-            spread=spread,
-            again=other,
-        )
-
-
-def _read(path: Path) -> dict[str, Any] | None:
+def _read(path: Path) -> Row | None:
     if not path.is_file():
         return None
     try:

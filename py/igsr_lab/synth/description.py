@@ -1,4 +1,4 @@
-"""A procedural scene as data: shapes with materials, lights and a sky, nothing of the renderer."""
+"""A synthetic scene as data: shapes with materials, lights and a sky, without the renderer."""
 
 from __future__ import annotations
 
@@ -11,29 +11,23 @@ from igsr_lab.synth.meshes import Mesh
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """What a surface is made of; two-sided unless it is glass.
+    """A surface; two-sided unless it is glass.
 
     Attributes:
         kind: "matte" (Lambertian), "glossy" (a rough dielectric coat over a matte base), "metal"
-            (a rough conductor of this colour) or "glass" (smooth, clear).
-        colour: sRGB in [0, 1], [3] or a texture [H, W, 3], repeated; of no meaning for glass.
+            (a rough conductor of this color) or "glass" (smooth, clear).
+        color: sRGB in [0, 1], [3] or a repeated texture [H, W, 3]; not used for glass.
         roughness: GGX alpha of glossy and metal.
     """
 
     kind: str
-    colour: np.ndarray
+    color: np.ndarray
     roughness: float = 0.2
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """One mesh with its material.
-
-    Attributes:
-        mesh: in world units (or those of the object it is a part of).
-        material: what it is made of.
-        smooth: whether normals are interpolated between faces.
-    """
+    """A mesh with a material; ``smooth`` interpolates normals between faces."""
 
     mesh: Mesh
     material: Material
@@ -42,14 +36,7 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """A rectangle that shines to one side.
-
-    Attributes:
-        at: its centre.
-        towards: the point that it faces.
-        size: half extents.
-        radiance: linear RGB, [3].
-    """
+    """A rectangle at a point that emits towards another; ``size`` has half extents."""
 
     at: np.ndarray
     towards: np.ndarray
@@ -62,18 +49,17 @@ class Description:
     """A whole scene; lengths in world units, z up.
 
     Attributes:
-        family: "object" (photos are transparent where nothing is hit) or "surroundings".
-        kind: what the surroundings are, "none" for the family "object".
-        contents: the names of the objects in it.
+        family: "object" (photos have a transparent background) or "surroundings".
+        kind: of the surroundings; "none" for the family "object".
+        contents: names of the objects.
         objects: the parts that masks show.
         surroundings: all other parts.
-        lights: beside the sky.
-        sky: linear RGB radiance, equirectangular [H, W, 3], row 0 at the zenith, or None for none.
-        centre: the point that cameras look at, about.
-        radius: how far the objects reach from ``centre``.
-        open_towards: the azimuth in radians from which objects are seen best, or None where they
-            can be seen from all around.
-        room: how far from ``centre`` cameras may stand; infinite outdoors.
+        lights: all lights except the sky.
+        sky: linear RGB radiance, equirectangular [H, W, 3], row 0 at the zenith, or None.
+        center: about the point that cameras look at.
+        radius: maximum distance of the objects from ``center``.
+        open_towards: azimuth in radians from which objects are seen best, or None for all.
+        room: maximum distance of cameras from ``center``; infinite outdoors.
     """
 
     family: str
@@ -83,7 +69,7 @@ class Description:
     sky: np.ndarray | None
     surroundings: list[Part] = field(default_factory=list)
     lights: list[Light] = field(default_factory=list)
-    centre: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    center: np.ndarray = field(default_factory=lambda: np.zeros(3))
     radius: float = 1.0
     open_towards: float | None = None
     room: float = np.inf

@@ -1,13 +1,8 @@
-"""``python -m igsr_lab study denoiser-table``: degraded reconstructions before and after denoising.
-
-The paper's Table 1. Held-out views of degraded fits are rendered, denoised and scored, so that a
-denoiser is compared on what it is for.
-"""
+"""``denoiser_table``: renders of degraded fits before and after denoising, the paper's Table 1."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -20,46 +15,34 @@ from igsr.denoiser.weights import SHIPPED, load_network
 from igsr.errors import IgsrError
 from igsr_lab.denoiser.pair_files import read_pairs
 from igsr_lab.denoiser.perceptual_distance import SqueezeNetDistance
+from igsr_lab.figures import write_sheet
 from igsr_lab.study.artifact_likeness import Likeness, likeness, plot_likeness
-from igsr_lab.study.cleaned_renders import (
-    Cleaned,
-    Cleaning,
-    Picture,
-    ViewToClean,
-    eight_bits,
-    run_cleaning,
-)
+from igsr_lab.study.cleaned_renders import Cleaned, Cleaning, ViewToClean, run_cleaning, to_uint8
 from igsr_lab.study.degraded_fits import (
+    DEFAULT_KINDS,
     FEW,
     KINDS,
-    USUAL,
     DegradedFit,
-    planned_fits,
+    planned_runs,
     run_fit,
     scenes_in,
 )
-from igsr_lab.study.denoiser_plots import plot_confidence, plot_gains
-from igsr_lab.study.denoiser_report import BEFORE, OURS, ComparedFit, comparison_report, markdown
-from igsr_lab.study.picture_sheet import write_sheet
-from igsr_lab.study.study_files import write_study_files
+from igsr_lab.study.denoiser_report import (
+    BEFORE,
+    OURS,
+    ComparedFit,
+    comparison_report,
+    plot_confidence,
+    plot_gains,
+    table_lines,
+)
+from igsr_lab.study.scoring import Picture
+from igsr_lab.study.study import Row, Study
 
 
 @dataclass(frozen=True)
 class ComparisonSettings:
-    """What to compare; see ``denoiser_table``.
-
-    Attributes:
-        scenes: names of folders in the data, no two with the same last part.
-        kinds: of degraded fits.
-        seeds: how many seeds, from 0.
-        backend: what fits and renders.
-        denoisers: further ones beside igsr's, weights by name.
-        features: SqueezeNet's arrays, or None.
-        pairs: folder of the training pairs, or None.
-
-    Raises:
-        IgsrError: a setting cannot be used, or a file that it names cannot be read.
-    """
+    """Checked arguments of ``denoiser_table``."""
 
     scenes: tuple[str, ...]
     kinds: tuple[str, ...]
@@ -71,8 +54,6 @@ class ComparisonSettings:
 
     def __post_init__(self) -> None:
         """Check everything before the first fit."""
-        if self.seeds < 1:
-            raise IgsrError("seeds must be at least 1.")
         unknown = [kind for kind in self.kinds if kind not in KINDS]
         if unknown or not self.kinds:
             raise IgsrError(f"kinds must be of {', '.join(KINDS)}, not {(*unknown, 'none')[0]!r}.")
@@ -86,15 +67,15 @@ class ComparisonSettings:
             SqueezeNetDistance(self.features)
         if self.pairs is not None and not self.training_files:
             raise IgsrError(f"{self.pairs} holds no pairs of recipe sparse; make some.")
-        if twice := _repeated([one.name for one in self.fits]):
-            scenes = [one.scene for one in self.fits if one.name in twice]
+        if twice := _repeated([fit.name for fit in self.fits]):
+            scenes = [fit.scene for fit in self.fits if fit.name in twice]
             raise IgsrError(
                 f"files of {scenes[0]} and {scenes[-1]} would have one name; rename one."
             )
 
     @property
     def scene_names(self) -> dict[str, str]:
-        """What the report calls each scene: the last part of its folder."""
+        """Name of each scene in the report: the last part of its folder."""
         return {scene: scene.rsplit("/", 1)[-1] for scene in self.scenes}
 
     @property
@@ -104,7 +85,7 @@ class ComparisonSettings:
 
     @property
     def training_files(self) -> list[Path]:
-        """Training pairs of recipe "sparse"; the file of a killed run begins with a dot."""
+        """Training pairs of recipe "sparse"; files of killed runs begin with a dot."""
         return [] if self.pairs is None else sorted(self.pairs.glob("[!.]*-sparse-*.npz"))
 
     @property
@@ -119,69 +100,49 @@ class ComparisonSettings:
 
 
 def denoiser_table(
-    data: str | os.PathLike[str],
-    out: str | os.PathLike[str],
+    study: Study,
     *,
     scenes: tuple[str, ...] | None = None,
-    kinds: tuple[str, ...] = USUAL,
-    denoisers: Mapping[str, str | os.PathLike[str]] | None = None,
-    features: str | os.PathLike[str] | None = None,
-    pairs: str | os.PathLike[str] | None = None,
-    seeds: int = 1,
-    backend: FitBackend = "cpu",
-    jobs: int = 1,
-    on_run: Callable[[int, int, dict[str, Any]], None] | None = None,
-    ray: bool = False,
-) -> dict[str, Any]:
-    """Denoise renders of degraded fits with igsr's denoiser and others, and write their scores.
+    kinds: tuple[str, ...] = DEFAULT_KINDS,
+    denoisers: Mapping[str, Path] | None = None,
+    features: Path | None = None,
+    pairs: Path | None = None,
+) -> Row:
+    """Denoise renders of degraded fits with igsr's denoiser and others, and score them.
 
     Args:
-        data: folder that holds the scenes, or folders of scenes.
-        out: folder for ``study.json``, ``study.md``, ``study.png``, ``confidence.png``, a sheet of
-            truth, render and denoised pictures for each scene, ``renders/`` and ``runs/``; what is
-            there is not done again.
-        scenes: names of folders in ``data``; None is all that hold photos with cameras.
+        study: its data has scenes, or folders of scenes. Its folder also gets ``confidence.png``, a
+            sheet of pictures per scene, and ``renders/``.
+        scenes: names of folders in the data; None is all captures with cameras.
         kinds: of degraded fits: "3", "6", "9" (photos), "noise" (on the cameras) and "paper" (its
             noise and steps).
-        denoisers: further ones, weights by name: the paper's losses trained on the same pairs.
-        features: SqueezeNet's arrays (.npz), to score by ``SqueezeNetDistance`` as well.
-        pairs: folder of the training pairs, to compare their errors with those of the renders from
-            few photographs here (of scenes without alpha, if there are any; see
-            ``artifact_likeness``); also writes ``artifacts.png``.
-        seeds: how many seeds, from 0.
-        backend: what fits and renders.
-        jobs: fits at a time, each in a process of its own with its share of the cores.
-        on_run: called with (done, all, the fit's row) after each fit.
-        ray: fits run over a Ray cluster instead (``pip install 'igsr[ray]'``).
+        denoisers: files of weights by name, in addition to igsr's.
+        features: SqueezeNet's arrays (.npz), to score a perceptual distance, too.
+        pairs: folder of training pairs, whose errors are compared with those of renders from few
+            photographs (see ``artifact_likeness``); also writes ``artifacts.png``.
 
     Returns:
-        What ``study.json`` holds: "scenes" by the folder's name with "before", "after" (igsr's
-        denoiser), "others" by name, each a mean over kinds and seeds, and "kinds" with the same for
-        each; "mean" over scenes of "sparse" and "noise"; "confidence"; "artifacts" if ``pairs`` is
-        given; "runs"; "protocol".
+        The content of ``study.json``: "scenes" by name with "before", "after" (igsr's denoiser) and
+        "others" by name, means over kinds and seeds, and "kinds" with the same for each; "mean"
+        over scenes of "sparse" and "noise"; "confidence"; "artifacts"; "runs"; "protocol".
 
     Raises:
-        IgsrError: a scene cannot be read or has too few photos, a denoiser cannot be read, or a fit
-            fails.
+        IgsrError: an argument, a scene or a denoiser cannot be used, or a fit fails.
     """
-    data, out = Path(data), Path(out)
-    if jobs < 1:
-        raise IgsrError("jobs must be at least 1.")
+    out = study.out
     settings = ComparisonSettings(
-        scenes=scenes or scenes_in(data),
+        scenes=scenes or scenes_in(study.data),
         kinds=kinds,
-        seeds=seeds,
-        backend=backend,
-        denoisers={name: Path(path) for name, path in (denoisers or {}).items()},
-        features=None if features is None else Path(features),
-        pairs=None if pairs is None else Path(pairs),
+        seeds=study.seeds,
+        backend=study.backend,
+        denoisers=denoisers or {},
+        features=features,
+        pairs=pairs,
     )
-    planned = planned_fits(data, out, settings.fits)
-    rows = finished_runs(
-        out / "runs", planned.runs, partial(run_fit, out), str(data), jobs, on_run, ray
-    )
+    runs, photographs = planned_runs(study.data, out, settings.fits)
+    rows = study.rows(runs, partial(run_fit, out))
     columns = {
-        name: _cleaned(out, settings, name, weights, jobs)
+        name: _cleaned(out, settings, name, weights, study.jobs)
         for name, weights in {BEFORE: None, **settings.weights}.items()
     }
     compared = [
@@ -192,28 +153,26 @@ def denoiser_table(
         compared,
         settings.scene_names,
         kinds,
-        seeds,
+        study.seeds,
         perceptual=features is not None,
-        artifacts=_artifacts(out, settings, planned.photographs),
+        artifacts=_artifacts(out, settings, photographs),
     )
-    write_study_files(out, report, markdown(report))
     plot_gains(out / "study.png", report)
     plot_confidence(out / "confidence.png", report["confidence"])
     for scene, name in settings.scene_names.items():
         write_sheet(out / f"{name}.png", _sheet(out, settings, scene))
-    return report
+    return study.write(report, table_lines)
 
 
 def _cleaned(
     out: Path, settings: ComparisonSettings, name: str, weights: Path | None, jobs: int
 ) -> list[Cleaned]:
-    """What one denoiser (None: none) makes of all fits' renders."""
+    """Scores of one denoiser (None: none) on all fits' renders."""
     features = settings.features
-    depends = {
+    depends: dict[str, Any] = {
         "weights": None if weights is None else file_hash(weights),
         "doubt": DOUBT,
-        # Older runs have this name.
-        "unseen_change": MIN_CHANGE,
+        "unseen_change": MIN_CHANGE,  # the name in older runs
         "perceptual": None if features is None else file_hash(features),
     }
     runs = [
@@ -235,10 +194,9 @@ def _cleaned(
 def _artifacts(
     out: Path, settings: ComparisonSettings, photographs: frozenset[str]
 ) -> Likeness | None:
-    """How alike errors here are to those of the training pairs, also as ``artifacts.png``."""
+    """Compare errors of renders from few photographs with those of training pairs; plot them."""
     if settings.pairs is None:
         return None
-    # Without any photographs the scenes with alpha must do.
     scenes = photographs or set(settings.scenes)
     real = [
         read_pairs(fit.renders(out))
@@ -252,16 +210,16 @@ def _artifacts(
 
 
 def _sheet(out: Path, settings: ComparisonSettings, scene: str) -> dict[str, dict[str, Picture]]:
-    """For each kind of fit the middle view: truth, render, and what each denoiser makes of it."""
+    """The middle view by kind of fit: photo, render, and the result of each denoiser."""
     denoisers = {
         name: NetworkDenoiser(load_network(path)) for name, path in settings.weights.items()
     }
     sheet = {}
-    for fit in (one for one in settings.fits if one.scene == scene and one.seed == 0):
+    for fit in (fit for fit in settings.fits if fit.scene == scene and fit.seed == 0):
         pairs = read_pairs(fit.renders(out))
         view = ViewToClean.of_pairs(pairs, len(pairs.truth) // 2)
         sheet[fit.kind] = {"truth": view.truth, "render": view.render} | {
-            name: eight_bits(denoiser.clean(view.inputs)[0]) for name, denoiser in denoisers.items()
+            name: to_uint8(denoiser.clean(view.inputs)[0]) for name, denoiser in denoisers.items()
         }
     return sheet
 
