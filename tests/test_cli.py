@@ -19,8 +19,6 @@ import scenes
 from PIL import Image
 
 import igsr
-from igsr.cli.shared import PresetChoice
-from igsr.fitting.presets import PRESETS
 
 COMMAND = [sys.executable, "-m", "igsr.cli"]
 FIT = ["--steps", "60", "--max-splats", "300", "--sh-degree", "1", "--backend", "cpu"]
@@ -418,32 +416,3 @@ def test_missing_adapter_is_a_sentence(capture_path, tmp_path):
     )  # fmt: skip
     refused(result, "adapter")
     assert not (tmp_path / "out").exists()
-
-
-def test_study_few_photos(lab_here, tmp_path, monkeypatch):
-    from igsr_lab.study import scored_fits as fits
-
-    scenes.write_capture(tmp_path / "leaf", scenes.capture(views=10, size=16))
-
-    def quick(load, data, one, refined):
-        scores = {
-            "psnr": 20.0,
-            "psnr_refined": 21.0,
-            "ssim": 0.9,
-            "flip": 0.1,
-            "splats": 10,
-            "seconds": 1.0,
-        }
-        return {**vars(one), **scores, "protocol": {"ssim": "window", "flip": "LDR"}}
-
-    monkeypatch.setattr(fits, "run_fit", quick)
-    study = ["study", "few-photos", tmp_path, "--out", tmp_path / "out", "--scene", "leaf"]
-    done = lab_here(*study, "--views", "3", "--preset", "default", "--seeds", "1")
-    assert done.returncode == 0, done.stderr
-    assert "1 of 1: leaf views 3 default seed 0: 20.00 dB" in done.stderr
-    assert "| leaf | 3 | default | 20.00 | 21.00 |" in done.stdout
-    refused(lab_here(*study, "--views", "9"), "leaf", "has 8 photos", "not 9")
-
-
-def test_every_preset_can_be_named():
-    assert tuple(choice.value for choice in PresetChoice) == PRESETS

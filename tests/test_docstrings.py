@@ -18,8 +18,8 @@ from igsr._internal.settings import settings_of
 #: Packages whose ``__all__`` is public.
 ROOMS = (
     *("igsr", "igsr.capture", "igsr.geometry", "igsr.rendering", "igsr.evaluation", "igsr.pose"),
-    *("igsr.fitting", "igsr.denoiser", "igsr_lab.denoiser", "igsr.refinement"),
-    *("igsr.compaction", "igsr_lab.bench", "igsr.floaters"),
+    *("igsr.fitting", "igsr.denoiser", "igsr.refinement"),
+    *("igsr.compaction", "igsr.floaters"),
 )
 SECTIONS = ("Args", "Attributes", "Raises", "Returns", "Yields")
 

@@ -15,14 +15,10 @@ from igsr.capture import Capture
 from igsr.cli import app
 from igsr.evaluation.scores import BLACK
 from igsr.fitting.pose_refinement import refine_cameras
-from igsr.fitting.settings import FitSettings
 from igsr.geometry.camera_noise import Noise, noise_unit, noisy_view
 from igsr.geometry.pose_errors import pose_errors
 from igsr.geometry.similarity import Similarity, similarity_between
-from igsr_lab.__main__ import app as lab_app
-from igsr_lab.study import noisy_poses, pose_noise
-from igsr_lab.study.noisy_poses import CLEAN, PoseFit, compared, run_fit
-from igsr_lab.study.noisy_poses import markdown as pose_table
+from igsr_lab.study.noisy_poses import CLEAN
 
 
 def turn(degrees, axis=(0.3, 1.0, -0.2)):
@@ -352,111 +348,3 @@ def test_the_photo_is_sheared_by_what_the_camera_is_not():
     # Half covered pixels keep their colour.
     assert moved[2, 2].tolist() == [200, 100, 50, 128]
     assert moved[2, 3].tolist() == [200, 100, 50, 128]
-
-
-def stand_in(data, one):
-    level = {"clean": 28.0, "fixed": 18.0, "joint": 27.0}[
-        "clean" if one.noise == CLEAN else one.poses
-    ]
-    scores = {
-        way: {"psnr": level + more, "ssim": 0.9, "flip": 0.1}
-        for way, more in (("raw", -1.0), ("aligned", 0.0), ("refined", 0.5 * one.seed))
-    }
-    return {
-        "scene": one.scene,
-        "noise": str(one.noise),
-        "poses": one.poses,
-        "seed": one.seed,
-        "backend": one.backend,
-        "before": {"rotation": 0.6, "centre": 0.02},
-        "after": {"rotation": 0.1, "centre": 0.005},
-        "splats": 10,
-        "seconds": 1.0,
-        "protocol": {"views": 2},
-        **scores,
-    }
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory, scene):
-    folder = tmp_path_factory.mktemp("noise")
-    full = scenes.capture(views=98, size=16, alpha=True, scene=scenes.splats(count=10))
-    for split, views in (("train", full.views[:96]), ("test", full.views[96:])):
-        scenes.write_capture(folder / "ball", Capture(full.path, views))
-        (folder / "ball/transforms.json").rename(folder / f"ball/transforms_{split}.json")
-    return folder
-
-
-def test_the_study_compares_what_the_protocol_says(data, tmp_path, monkeypatch):
-    monkeypatch.setattr(noisy_poses, "run_fit", stand_in)
-    report = pose_noise(data, tmp_path, scenes=("ball",), turns=(2.0,), raw_affine=True, seeds=2)
-    assert [line["noise"] for line in report["summary"][::2]] == [
-        "matrix 0.01",
-        "turn 2°",
-        "raw-affine 0.01",
-    ]
-    line = report["summary"][0]
-    assert line["recovered"] == pytest.approx(0.9)
-    assert line["short_of_clean"] == pytest.approx(1.0)
-    assert line["joint"]["psnr_spread"] == pytest.approx(0.5 / np.sqrt(2.0))
-    assert json.loads((tmp_path / "study.json").read_text()) == report
-    table = (tmp_path / "study.md").read_text()
-    assert table == pose_table(report)
-    assert "| 90 % | 1.00 | 0.600 → 0.100 (6.0 ×) | 0.0200 → 0.0050 (4.0 ×) |" in table
-    assert (tmp_path / "study.png").stat().st_size > 1000
-    assert compared(report["runs"], "turn 2°", "ball") == report["summary"][2]
-
-
-def test_a_real_fit_of_the_study(data, monkeypatch):
-    from igsr.fitting import presets
-
-    short = FitSettings(
-        steps=40,
-        max_splats=300,
-        sh_degree=0,
-        density="fixed",
-        dropout=0.2,
-        start="auto",
-        coarse_to_fine=False,
-        depth_weight=0.0,
-        learning_rate=1.0,
-        poses="fixed",
-        focal="fixed",
-        exposure="off",
-        transients="off",
-        remove_floaters=False,
-        backdrop=False,
-    )
-    monkeypatch.setattr(presets, "_default", lambda *_: short)
-    row = run_fit(str(data), PoseFit("ball", Noise("turn", 1.0), "joint", 0, "cpu"))
-    assert row["before"]["rotation"] == pytest.approx(1.0, abs=0.2)
-    assert set(row["refined"]) == {"psnr", "ssim", "flip"}
-    assert row["refined"]["psnr"] > 10.0
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"seeds": 0}, "seeds"),
-        ({"noise": -1.0}, "noise and turns"),
-        ({"turns": (float("nan"),)}, "noise and turns"),
-        ({"scenes": ("nothing",)}, "holds no transforms_train.json"),
-    ],
-)
-def test_what_the_study_cannot_use_is_named(data, tmp_path, options, message):
-    with pytest.raises(igsr.IgsrError, match=message):
-        pose_noise(data, tmp_path, **{"scenes": ("ball",), **options})
-
-
-def test_options_of_other_protocols_are_refused(data, tmp_path):
-    for protocol, option in [
-        ("pose-noise", ["--preset", "3dgs"]),
-        ("pose-noise", ["--views", "75"]),
-        ("blender8", ["--raw-affine"]),
-        ("few-photos", ["--noise", "0.1"]),
-    ]:
-        result = CliRunner().invoke(
-            lab_app, ["study", protocol, str(data), "--out", str(tmp_path), *option]
-        )
-        assert result.exit_code == 2
-        assert f"No such option: {option[0]}" in result.stderr

@@ -24,7 +24,7 @@ from igsr_lab.bench.plots import plot_speed_vs_error
 from igsr_lab.bench.scenes import Arrays, Scene, ball
 from igsr_lab.bench.stage_rows import pipeline_rows
 from igsr_lab.bench.table import describe_machine, machine_line, milliseconds
-from igsr_lab.markdown import markdown_table
+from igsr_lab.report_parts import markdown_table
 
 #: The scene: few splats of about a pixel, whose antialiasing matters.
 COUNT = 2000
@@ -118,15 +118,7 @@ def measure_accuracy(
     on_row: Callable[[str], object] = lambda doing: None,
     scene: Scene | None = None,
 ) -> dict[str, Any]:
-    """Measure every setting; return ``{"machine": ..., "rows": [...]}``.
-
-    Args:
-        backends: resolved names.
-        seed: of the scene.
-        seconds: time that each row is repeated.
-        on_row: called with a description before each row.
-        scene: the scene; None is the default of ``seed``.
-    """
+    """Measure every setting; return ``{"machine": ..., "rows": [...]}``."""
     scene = ball(seed, COUNT, WIDTH, HEIGHT, MAX_SH_DEGREE, SIZE) if scene is None else scene
     machine = describe_machine(list(backends), seed)
     on_row("errors of the settings")
@@ -141,15 +133,7 @@ def measure_accuracy(
 
 
 def write_accuracy(path: Path, report: dict[str, Any]) -> None:
-    """Write the page and its plot.
-
-    Args:
-        path: of the Markdown page.
-        report: from ``measure_accuracy``.
-
-    Raises:
-        IgsrError: a file cannot be written.
-    """
+    """Write the Markdown page and its plot."""
     plot_speed_vs_error(path.with_name(PLOT_NAME), report)
     with atomic_write(path) as temporary:
         temporary.write_text(accuracy_page(report), encoding="utf-8")

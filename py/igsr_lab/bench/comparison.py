@@ -86,6 +86,17 @@ def gradient_error(got: Arrays, expected: Arrays) -> Error:
     return Error(worst, worst_mean, where)
 
 
+def size_row(workload: str, backend: str, splats: int, width: int, height: int) -> dict[str, Any]:
+    """The columns of a row for its workload."""
+    return {
+        "workload": workload,
+        "backend": backend,
+        "splats": splats,
+        "width": width,
+        "height": height,
+    }
+
+
 def errors_row(of: str, error: Error, band: Band, picture: Error | None = None) -> dict[str, Any]:
     """The error columns of a row; ``picture`` is the picture's error if ``error`` is another."""
     row: dict[str, Any] = {

@@ -36,6 +36,7 @@ from igsr_lab.bench.comparison import (
     errors_row,
     gradient_error,
     picture_error,
+    size_row,
 )
 from igsr_lab.bench.scenes import PARAMETERS, Arrays, Scene
 from igsr_lab.bench.stage_rows import MIN_REPEATS, SECONDS, timing_row
@@ -369,6 +370,7 @@ def step_rows(
     shots, and the mean of their means.
     """
     scene = shots[0].scene
+    count = len(scene.splats["means"])
     passes: list[tuple[str, Loss, Any, Any]] = [
         ("fit step", fit_loss, fit_step_ms, _fit_gradients),
         ("fit step, own loop", charbonnier, _custom_loop_ms, _custom_gradients),
@@ -388,12 +390,8 @@ def step_rows(
         worst = max(gradients, key=lambda error: error.max)
         rows.append(
             {
-                "workload": workload,
-                "backend": backend,
+                **size_row(workload, backend, count, scene.width, scene.height),
                 "pass": name,
-                "splats": len(scene.splats["means"]),
-                "width": scene.width,
-                "height": scene.height,
                 "views": len(shots),
                 **timing_row(fastest, backend, None),
                 "ms": float(np.mean(fastest)),

@@ -46,13 +46,6 @@ def device_report(
 
     W2's scene, or W4's ball without a garden, is timed with gsplat, too, and the viewer's frames
     are timed. Software drivers get smaller scenes, and W4 another name.
-
-    Args:
-        settings: what to run.
-        on_row: called with a description before each workload.
-
-    Raises:
-        IgsrError: a file cannot be used.
     """
     on_row("the device")
     device = describe_device()
@@ -87,29 +80,14 @@ def device_report(
 
 
 def json_beside(path: Path) -> Path:
-    """File of a page's figures.
-
-    Args:
-        path: of the page.
-
-    Raises:
-        IgsrError: the page's name does not end in .html.
-    """
+    """File of a page's figures."""
     if path.suffix.lower() != ".html":
         raise IgsrError(f"{path}: a report is a page; give a name that ends in .html.")
     return path.with_suffix(".json")
 
 
 def write_device_report(path: Path, report: dict[str, Any]) -> None:
-    """Write the page and the JSON file.
-
-    Args:
-        path: of the page.
-        report: from ``device_report``, with "tests" if the kernels' tests were run.
-
-    Raises:
-        IgsrError: a file cannot be written.
-    """
+    """Write the page and the JSON file; the report may have "tests" of the kernels."""
     write_json(json_beside(path), report)
     variables = {
         "machine": report["machine"],

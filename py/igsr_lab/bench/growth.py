@@ -18,7 +18,7 @@ import numpy as np
 
 from igsr._internal.peak_memory import forget_peak, peak_bytes
 from igsr.errors import IgsrError
-from igsr_lab.bench.comparison import errors_row
+from igsr_lab.bench.comparison import errors_row, size_row
 from igsr_lab.bench.fit_rows import Shot, fit_step_ms, step_rows
 from igsr_lab.bench.scenes import ball, upstream
 from igsr_lab.bench.stage_rows import compare, runs_on_cores, timing_row
@@ -84,12 +84,8 @@ def measure(seed: int, count: int, side: int, backend: str, seconds: float) -> d
     v_image = upstream(seed, side, side)
     comparison, _ = compare(shot.scene, backend, v_image, evenly_chosen)
     return {
-        "workload": "W4",
-        "backend": backend,
+        **size_row("W4", backend, count, side, side),
         "pass": "fit step",
-        "splats": count,
-        "width": side,
-        "height": side,
         **timing_row(np.array(times), backend, None),
         **memory,
         **errors_row("gradients", comparison.gradients, comparison.band, comparison.picture),
@@ -134,8 +130,7 @@ def growth_rows(
     buffers: dict[int, int] = {}
     too_slow: tuple[int, int] | None = None
     for count, side in points() if grid is None else grid:
-        common = {"workload": name, "backend": backend, "splats": count, "width": side}
-        common |= {"height": side, "pass": "fit step"}
+        common = size_row(name, backend, count, side, side) | {"pass": "fit step"}
         if too_slow is not None and count >= too_slow[0] and side >= too_slow[1]:
             reason = (
                 f"{too_slow[0]} splats at {too_slow[1]} x {too_slow[1]} took more than "

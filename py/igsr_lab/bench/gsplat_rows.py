@@ -12,7 +12,7 @@ import torch
 
 from igsr import _core
 from igsr.errors import IgsrError
-from igsr_lab.bench.comparison import BOUND_3D, errors_row
+from igsr_lab.bench.comparison import BOUND_3D, errors_row, size_row
 from igsr_lab.bench.scenes import Arrays, Scene
 from igsr_lab.bench.stage_rows import compare_picture, repeated
 
@@ -111,12 +111,8 @@ def gsplat_rows(
     }
     return [
         {
-            "workload": workload,
-            "backend": NAME,
+            **size_row(workload, NAME, len(scene.splats["means"]), scene.width, scene.height),
             "pass": name,
-            "splats": len(scene.splats["means"]),
-            "width": scene.width,
-            "height": scene.height,
             "ms": float(ms.min()),
             "ms_median": float(np.median(ms)),
             "repeats": len(ms),

@@ -7,7 +7,7 @@ from typing import Any
 
 from igsr_lab.bench.growth import GROWN_COUNT, GROWN_SIDE
 from igsr_lab.bench.table import machine_line
-from igsr_lab.figures import save_figure
+from igsr_lab.report_parts import new_figure, save_figure
 
 #: Colors that are distinct in print and for the color-blind (Okabe and Ito).
 COLORS = {"cpu": "#0072b2", "gpu": "#d55e00", "reference": "#444444"}
@@ -17,23 +17,13 @@ MIN_ERROR = 1e-16
 
 
 def plot_speed_vs_error(path: Path, report: dict[str, Any]) -> None:
-    """Plot time and largest error of each row, and W4's growth.
-
-    Args:
-        path: of the PNG.
-        report: from ``run_benchmark`` or ``measure_accuracy``.
-
-    Raises:
-        IgsrError: the file cannot be written.
-    """
-    from matplotlib.figure import Figure
-
+    """Plot time and largest error of each row of a report, and W4's growth."""
     measured = [row for row in report["rows"] if row["ms"] is not None]
     grown = [row for row in measured if _is_of_growth(row)]
     points = [row for row in measured if not _is_of_growth(row)]
     lines = (1 if points or not grown else 0) + (1 if grown else 0)
     columns = 4 if any("setting" in row for row in points) else 3
-    figure = Figure(figsize=(4.4 * columns, 4.4 * lines), layout="constrained")
+    figure = new_figure(4.4 * columns, 4.4 * lines)
     figure.suptitle(machine_line(report["machine"]), fontsize=8, wrap=True)
     axes = figure.subplots(lines, columns, squeeze=False)
     if points or not grown:

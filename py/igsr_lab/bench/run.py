@@ -72,14 +72,7 @@ def run_benchmark(
 ) -> dict[str, Any]:
     """Run the workloads; return ``{"machine": ..., "rows": [...]}``.
 
-    A workload that fails has a row with the reason; the others are kept.
-
-    Args:
-        settings: what to run.
-        on_row: called with a description before each workload.
-
-    Raises:
-        IgsrError: a file cannot be used.
+    A workload that fails has a row with the reason. ``on_row`` gets a description of each.
     """
     # Check files before the first minute of work.
     scene = None if settings.garden is None else garden(settings.garden, settings.seed)
@@ -152,9 +145,5 @@ def _capture_work(
 
 
 def resolved_backends(names: list[str]) -> tuple[str, ...]:
-    """Resolve backends and remove repeated ones.
-
-    Args:
-        names: "auto", "cpu", "gpu" or "reference".
-    """
+    """Resolve backends and remove repeated ones."""
     return tuple(dict.fromkeys(_core.resolve_backend(name) for name in names))

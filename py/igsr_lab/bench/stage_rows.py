@@ -20,6 +20,7 @@ from igsr_lab.bench.comparison import (
     errors_row,
     gradient_error,
     picture_error,
+    size_row,
 )
 from igsr_lab.bench.scenes import Arrays, Scene, splats2d, upstream
 
@@ -135,10 +136,7 @@ def rasterize_rows(
     exact = {name: array.astype(np.float64) for name, array in projected.items()}
     pairs = oracle.pair_counts(exact, side, side)
     common = {
-        "workload": "W1",
-        "backend": backend,
-        "splats": count,
-        **size,
+        **size_row("W1", backend, count, side, side),
         "tile_pairs": pairs.tiles,
         "pixel_pairs": pairs.pixels,
         "blended_pairs": pairs.blended,
@@ -190,18 +188,9 @@ def compare_picture(
     v_image: Arrays,
     chosen: Callable[[list[Any]], list[Any]] = list,
 ) -> tuple[Comparison, Arrays]:
-    """Compare any picture and gradients of a scene with the reference.
+    """Compare a picture ``got`` and its gradients with the reference; see ``compare``.
 
-    Args:
-        scene: the scene.
-        projected: its splats, projected in f32 by one of igsr's backends.
-        got: "color" [H, W, 3], "alpha" and "transmittance" [H, W].
-        gradients: from upstream gradients to those of ``_core.project_backward``'s names.
-        bound: see ``comparison.BOUND_3D``.
-        v_image, chosen: as ``compare``.
-
-    Returns:
-        The comparison, and the upstream gradients that count.
+    ``projected`` are the splats, projected in f32 by one of igsr's backends.
     """
     exact = oracle.project(scene, projected)
     crops = chosen(oracle.crops(exact, scene.width, scene.height))
@@ -227,13 +216,8 @@ def pipeline_rows(
     keywords = scene.options() | {name: v.astype(dtype) for name, v in v_image.items()}
     keywords |= {"background": scene.background.astype(dtype), "backend": backend}
     times = repeated(lambda n: _core.time_pipeline(*parameters, **keywords, repeats=n), seconds)
-    common = {
-        "workload": workload,
-        "backend": backend,
-        "splats": len(scene.splats["means"]),
-        "width": scene.width,
-        "height": scene.height,
-    }
+    count = len(scene.splats["means"])
+    common = size_row(workload, backend, count, scene.width, scene.height)
     passes = (
         ("forward", ("project", "rasterize"), "picture", comparison.picture),
         ("backward", ("rasterize_backward", "project_backward"), "gradients", comparison.gradients),

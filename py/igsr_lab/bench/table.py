@@ -109,23 +109,13 @@ def not_run_lines(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def print_report(console: Console, report: dict[str, Any]) -> None:
-    """Print the rows, those that did not run, and the protocol.
-
-    Args:
-        console: the console.
-        report: from ``run_benchmark``.
-    """
+    """Print the rows, those that did not run, and the protocol."""
     rows = [_cells(row) for row in report["rows"] if row["ms"] is not None]
     _print(console, report, HEADINGS, rows, not_run_lines(report["rows"]))
 
 
 def print_pairs(console: Console, report: dict[str, Any]) -> None:
-    """Print the rows of two builds.
-
-    Args:
-        console: the console.
-        report: from ``compare_builds``.
-    """
+    """Print the rows of two builds."""
     rows = [_pair_cells(row) for row in report["rows"] if row["ratio"] is not None]
     failed = [
         f"{row['workload']} with {row['splats']} splats on {row['backend']} not compared: "

@@ -24,6 +24,7 @@ import numpy as np
 
 from igsr import _core
 from igsr.errors import IgsrError
+from igsr_lab.bench.comparison import size_row
 from igsr_lab.bench.fit_rows import fit_step_ms
 from igsr_lab.bench.growth import evenly_chosen, shot_of
 from igsr_lab.bench.scenes import Arrays, splats2d, upstream
@@ -38,8 +39,8 @@ STAGES = (20_000, 400)
 STEPS = ((20_000, 400), (100_000, 512), (1_000_000, 512), (100_000, 2048))
 PAIR_PROTOCOL = (
     "Two processes, each with one build, take turns; the order alternates. ratio is old : new, "
-    "each the minimum over its repeats of that round: the median over the rounds, with the smallest and "
-    "the largest. Errors are against the f64 reference."
+    "each the minimum over its repeats of that round: the median over the rounds, with the "
+    "smallest and the largest. Errors are against the f64 reference."
 )
 #: The build must be loaded before the benchmark is imported.
 _CHILD = """
@@ -188,19 +189,9 @@ def compare_builds(
     on_row: Callable[[str], object] = lambda doing: None,
     rounds: int = ROUNDS,
 ) -> dict[str, Any]:
-    """Time another build and this one in turns; return ``{"machine": ..., "rows": [...]}``.
+    """Time another build's compiled module, "old" in ratios, and this build in turns.
 
-    Args:
-        other: the other build's compiled module (``igsr/_core*.so``), "old" in ratios.
-        backends: resolved names.
-        workloads: some of "W1" and "W4".
-        seed: random seed.
-        seconds: time that each build repeats a workload.
-        on_row: called with a description before each workload.
-        rounds: number of turns.
-
-    Raises:
-        IgsrError: the file is missing or not a build for this Python.
+    Returns ``{"machine": ..., "rows": [...]}``.
     """
     if not other.is_file():
         raise IgsrError(f"There is no file {other}; give --compare a build's compiled module.")
@@ -210,8 +201,7 @@ def compare_builds(
         settings: dict[str, Any] = {"workloads": list(workloads), "backend": backend, "seed": seed}
         with Build(other.resolve(), settings) as old, Build(None, settings) as new:
             for work in all_work(**settings):
-                common = {"workload": work.workload, "backend": backend, "splats": work.splats}
-                common |= {"width": work.side, "height": work.side}
+                common = size_row(work.workload, backend, work.splats, work.side, work.side)
                 on_row(f"{work.name.replace(' ', ', ')} on {backend}, two builds")
                 rows += pair_rows(common, old, new, work.name, seconds / rounds, rounds)
     return {"machine": machine, "rows": rows}
@@ -261,12 +251,7 @@ def pair_rows(
 
 
 def slower_rows(rows: list[dict[str, Any]], percent: float) -> list[str]:
-    """One sentence per row in which this build takes more than ``percent`` longer, or fails.
-
-    Args:
-        rows: from ``compare_builds``.
-        percent: of the other build's time.
-    """
+    """One sentence per row in which this build takes more than ``percent`` longer, or fails."""
     failed = [
         f"{row['workload']} with {row['splats']} splats on {row['backend']}: {row['not_run']}."
         for row in rows

@@ -12,6 +12,7 @@ from typing import Any
 
 from igsr.errors import IgsrError
 from igsr.splats import Splats
+from igsr_lab.bench.comparison import size_row
 from igsr_lab.bench.scenes import ball
 
 VIEWER = "viewer"
@@ -47,12 +48,8 @@ def viewer_rows(size: tuple[int, int], seed: int, small: bool) -> list[dict[str,
         raise IgsrError(f"The viewer printed no times: {text.strip()}")
     return [
         {
-            "workload": VIEWER,
-            "backend": "gpu",
+            **size_row(VIEWER, "gpu", count, width, height),
             "pass": "frame",
-            "splats": count,
-            "width": width,
-            "height": height,
             "ms": stages.pop("least"),
             "ms_median": stages.pop("whole"),
             "stages_ms": stages,

@@ -29,7 +29,7 @@ from igsr_lab.denoiser.losses import Loss, Prediction, charbonnier, regret
 from igsr_lab.denoiser.pair_sets import PairSets, read_pair_sets
 from igsr_lab.denoiser.perceptual_distance import Distance, distance_name
 from igsr_lab.denoiser.training_settings import Training
-from igsr_lab.figures import save_figure
+from igsr_lab.report_parts import new_figure, save_figure
 
 WEIGHTS = "denoiser.safetensors"
 CHECKPOINT = "checkpoint.pt"
@@ -317,8 +317,6 @@ def _tensorboard(out: Path) -> Any:
 
 def plot_training(log: Path, path: Path) -> list[dict[str, Any]]:
     """Plot every quantity of a training's log over its steps; return the log's rows."""
-    from matplotlib.figure import Figure
-
     try:
         rows = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
     except (OSError, ValueError) as error:
@@ -334,7 +332,7 @@ def plot_training(log: Path, path: Path) -> list[dict[str, Any]]:
     ]
     if not drawn:
         raise IgsrError(f"{log} holds nothing to plot; train again.")
-    figure = Figure(figsize=(10.0, 2.4 * -(-len(drawn) // 2)), layout="constrained")
+    figure = new_figure(10.0, 2.4 * -(-len(drawn) // 2))
     axes = figure.subplots(-(-len(drawn) // 2), 2, squeeze=False).ravel()
     for axis in axes[len(drawn) :]:
         axis.remove()

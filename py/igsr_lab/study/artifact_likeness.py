@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from igsr.denoiser.inputs import COLOR
 from igsr_lab.denoiser.pair_files import Pairs
-from igsr_lab.figures import save_figure
+from igsr_lab.report_parts import new_figure, save_figure
 
 Float64 = npt.NDArray[np.float64]
 
@@ -114,9 +114,7 @@ def plot_likeness(
     path: Path, found: Likeness, real: Sequence[Pairs], synthetic: Sequence[Pairs]
 ) -> None:
     """Plot a real and a synthetic render with their errors, and both sets' spectra."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11.0, 4.6), layout="constrained")
+    figure = new_figure(11.0, 4.6)
     axes = figure.subplot_mosaic(
         [["real", "real error", "spectra"], ["synthetic", "synthetic error", "spectra"]],
         width_ratios=[1, 1, 1.6],

@@ -10,8 +10,7 @@ import numpy as np
 
 from igsr.denoiser.confidence import HALF_CONFIDENCE_ERROR
 from igsr_lab.denoiser.perceptual_distance import SqueezeNetDistance
-from igsr_lab.figures import save_figure
-from igsr_lab.markdown import cell, markdown_table
+from igsr_lab.report_parts import cell, markdown_table, new_figure, save_figure
 from igsr_lab.study.artifact_likeness import Likeness
 from igsr_lab.study.cleaned_renders import SCORES, Cleaned, Scores
 from igsr_lab.study.degraded_fits import FEW, NOISE, PAPER, SCORED_VIEWS, DegradedFit, described
@@ -151,15 +150,13 @@ def table_lines(report: Row) -> list[str]:
 
 def plot_gains(path: Path, report: Row) -> None:
     """Plot PSNR gains by scene and kind of fit, with a bar per denoiser."""
-    from matplotlib.figure import Figure
-
     lines = {
         f"{scene} {kind}": _by_name(of_kind)
         for scene, columns in report["scenes"].items()
         for kind, of_kind in columns["kinds"].items()
     }
     names = [name for name in next(iter(lines.values())) if name != BEFORE]
-    figure = Figure(figsize=(2.0 + 0.22 * len(lines) * len(names), 4.2), layout="constrained")
+    figure = new_figure(2.0 + 0.22 * len(lines) * len(names), 4.2)
     axis = figure.subplots()
     for k, name in enumerate(names):
         gains = []
@@ -179,10 +176,8 @@ def plot_gains(path: Path, report: Row) -> None:
 
 def plot_confidence(path: Path, confidence: Row) -> None:
     """Plot mean absolute error by predicted confidence, measured and claimed."""
-    from matplotlib.figure import Figure
-
     predicted = np.asarray(confidence["confidence"])
-    figure = Figure(figsize=(6.0, 4.2), layout="constrained")
+    figure = new_figure(6.0, 4.2)
     axis = figure.subplots()
     claimed = HALF_CONFIDENCE_ERROR * (1.0 / np.maximum(predicted, 1e-3) - 1.0)
     axis.plot(predicted, claimed, "--", color="gray", label="as claimed")

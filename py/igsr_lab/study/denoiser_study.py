@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from igsr._internal.choices import FitBackend
 from igsr._internal.resumable_jobs import Run, file_hash, finished_runs
 from igsr.denoiser.cleaning import DOUBT, MIN_CHANGE, NetworkDenoiser
 from igsr.denoiser.weights import SHIPPED, load_network
 from igsr.errors import IgsrError
 from igsr_lab.denoiser.pair_files import read_pairs
 from igsr_lab.denoiser.perceptual_distance import SqueezeNetDistance
-from igsr_lab.figures import write_sheet
+from igsr_lab.report_parts import write_sheet
 from igsr_lab.study.artifact_likeness import Likeness, likeness, plot_likeness
 from igsr_lab.study.cleaned_renders import Cleaned, Cleaning, ViewToClean, run_cleaning, to_uint8
 from igsr_lab.study.degraded_fits import (
@@ -41,62 +40,14 @@ from igsr_lab.study.study import Row, Study
 
 
 @dataclass(frozen=True)
-class ComparisonSettings:
+class Comparison:
     """Checked arguments of ``denoiser_table``."""
 
-    scenes: tuple[str, ...]
-    kinds: tuple[str, ...]
-    seeds: int
-    backend: FitBackend
-    denoisers: Mapping[str, Path] = field(default_factory=dict)
-    features: Path | None = None
-    pairs: Path | None = None
-
-    def __post_init__(self) -> None:
-        """Check everything before the first fit."""
-        unknown = [kind for kind in self.kinds if kind not in KINDS]
-        if unknown or not self.kinds:
-            raise IgsrError(f"kinds must be of {', '.join(KINDS)}, not {(*unknown, 'none')[0]!r}.")
-        if twice := _repeated([*self.scene_names.values()]):
-            raise IgsrError(f"two scenes are called {twice[0]}; name the scenes to study.")
-        if {OURS, BEFORE} & set(self.denoisers):
-            raise IgsrError(f"denoisers cannot be called {OURS} or {BEFORE}; choose another name.")
-        for path in self.weights.values():
-            load_network(path)
-        if self.features is not None:
-            SqueezeNetDistance(self.features)
-        if self.pairs is not None and not self.training_files:
-            raise IgsrError(f"{self.pairs} holds no pairs of recipe sparse; make some.")
-        if twice := _repeated([fit.name for fit in self.fits]):
-            scenes = [fit.scene for fit in self.fits if fit.name in twice]
-            raise IgsrError(
-                f"files of {scenes[0]} and {scenes[-1]} would have one name; rename one."
-            )
-
-    @property
-    def scene_names(self) -> dict[str, str]:
-        """Name of each scene in the report: the last part of its folder."""
-        return {scene: scene.rsplit("/", 1)[-1] for scene in self.scenes}
-
-    @property
-    def weights(self) -> dict[str, Path]:
-        """Files of all denoisers by name, igsr's first."""
-        return {OURS: SHIPPED, **self.denoisers}
-
-    @property
-    def training_files(self) -> list[Path]:
-        """Training pairs of recipe "sparse"; files of killed runs begin with a dot."""
-        return [] if self.pairs is None else sorted(self.pairs.glob("[!.]*-sparse-*.npz"))
-
-    @property
-    def fits(self) -> list[DegradedFit]:
-        """All fits, sorted by scene."""
-        return [
-            DegradedFit(scene, kind, seed, self.backend)
-            for scene in self.scenes
-            for seed in range(self.seeds)
-            for kind in self.kinds
-        ]
+    out: Path
+    fits: list[DegradedFit]
+    weights: dict[str, Path]
+    features: Path | None
+    training_files: list[Path]
 
 
 def denoiser_table(
@@ -125,50 +76,81 @@ def denoiser_table(
         The content of ``study.json``: "scenes" by name with "before", "after" (igsr's denoiser) and
         "others" by name, means over kinds and seeds, and "kinds" with the same for each; "mean"
         over scenes of "sparse" and "noise"; "confidence"; "artifacts"; "runs"; "protocol".
-
-    Raises:
-        IgsrError: an argument, a scene or a denoiser cannot be used, or a fit fails.
     """
+    scenes = scenes or scenes_in(study.data)
+    settings = _checked(study, scenes, kinds, denoisers or {}, features, pairs)
     out = study.out
-    settings = ComparisonSettings(
-        scenes=scenes or scenes_in(study.data),
-        kinds=kinds,
-        seeds=study.seeds,
-        backend=study.backend,
-        denoisers=denoisers or {},
-        features=features,
-        pairs=pairs,
-    )
     runs, photographs = planned_runs(study.data, out, settings.fits)
     rows = study.rows(runs, partial(run_fit, out))
     columns = {
-        name: _cleaned(out, settings, name, weights, study.jobs)
+        name: _cleaned(settings, name, weights, study.jobs)
         for name, weights in {BEFORE: None, **settings.weights}.items()
     }
     compared = [
         ComparedFit(fit, row, {name: column[k] for name, column in columns.items()})
         for k, (fit, row) in enumerate(zip(settings.fits, rows, strict=True))
     ]
+    names = _names(scenes)
     report = comparison_report(
         compared,
-        settings.scene_names,
+        names,
         kinds,
         study.seeds,
         perceptual=features is not None,
-        artifacts=_artifacts(out, settings, photographs),
+        artifacts=None if pairs is None else _artifacts(settings, photographs or {*scenes}),
     )
     plot_gains(out / "study.png", report)
     plot_confidence(out / "confidence.png", report["confidence"])
-    for scene, name in settings.scene_names.items():
-        write_sheet(out / f"{name}.png", _sheet(out, settings, scene))
+    for scene, name in names.items():
+        write_sheet(out / f"{name}.png", _sheet(settings, scene))
     return study.write(report, table_lines)
 
 
-def _cleaned(
-    out: Path, settings: ComparisonSettings, name: str, weights: Path | None, jobs: int
-) -> list[Cleaned]:
+def _checked(
+    study: Study,
+    scenes: tuple[str, ...],
+    kinds: tuple[str, ...],
+    denoisers: Mapping[str, Path],
+    features: Path | None,
+    pairs: Path | None,
+) -> Comparison:
+    """Check everything before the first fit."""
+    unknown = [kind for kind in kinds if kind not in KINDS]
+    if unknown or not kinds:
+        raise IgsrError(f"kinds must be of {', '.join(KINDS)}, not {(*unknown, 'none')[0]!r}.")
+    if twice := _repeated([*_names(scenes).values()]):
+        raise IgsrError(f"two scenes are called {twice[0]}; name the scenes to study.")
+    if {OURS, BEFORE} & set(denoisers):
+        raise IgsrError(f"denoisers cannot be called {OURS} or {BEFORE}; choose another name.")
+    weights = {OURS: SHIPPED, **denoisers}
+    for path in weights.values():
+        load_network(path)
+    if features is not None:
+        SqueezeNetDistance(features)
+    # Files of killed runs begin with a dot.
+    training_files = [] if pairs is None else sorted(pairs.glob("[!.]*-sparse-*.npz"))
+    if pairs is not None and not training_files:
+        raise IgsrError(f"{pairs} holds no pairs of recipe sparse; make some.")
+    fits = [
+        DegradedFit(scene, kind, seed, study.backend)
+        for scene in scenes
+        for seed in range(study.seeds)
+        for kind in kinds
+    ]
+    if twice := _repeated([fit.name for fit in fits]):
+        both = [fit.scene for fit in fits if fit.name in twice]
+        raise IgsrError(f"files of {both[0]} and {both[-1]} would have one name; rename one.")
+    return Comparison(study.out, fits, weights, features, training_files)
+
+
+def _names(scenes: Sequence[str]) -> dict[str, str]:
+    """Name of each scene in the report: the last part of its folder."""
+    return {scene: scene.rsplit("/", 1)[-1] for scene in scenes}
+
+
+def _cleaned(settings: Comparison, name: str, weights: Path | None, jobs: int) -> list[Cleaned]:
     """Scores of one denoiser (None: none) on all fits' renders."""
-    features = settings.features
+    out, features = settings.out, settings.features
     depends: dict[str, Any] = {
         "weights": None if weights is None else file_hash(weights),
         "doubt": DOUBT,
@@ -191,32 +173,27 @@ def _cleaned(
     return [Cleaned.of_row(row) for row in rows]
 
 
-def _artifacts(
-    out: Path, settings: ComparisonSettings, photographs: frozenset[str]
-) -> Likeness | None:
-    """Compare errors of renders from few photographs with those of training pairs; plot them."""
-    if settings.pairs is None:
-        return None
-    scenes = photographs or set(settings.scenes)
+def _artifacts(settings: Comparison, scenes: Collection[str]) -> Likeness:
+    """Compare errors of renders from few photos with those of training pairs; plot them."""
     real = [
-        read_pairs(fit.renders(out))
+        read_pairs(fit.renders(settings.out))
         for fit in settings.fits
         if fit.kind in FEW and fit.scene in scenes
     ]
     synthetic = [read_pairs(path) for path in settings.training_files]
     found = likeness(real, synthetic)
-    plot_likeness(out / "artifacts.png", found, real, synthetic)
+    plot_likeness(settings.out / "artifacts.png", found, real, synthetic)
     return found
 
 
-def _sheet(out: Path, settings: ComparisonSettings, scene: str) -> dict[str, dict[str, Picture]]:
+def _sheet(settings: Comparison, scene: str) -> dict[str, dict[str, Picture]]:
     """The middle view by kind of fit: photo, render, and the result of each denoiser."""
     denoisers = {
         name: NetworkDenoiser(load_network(path)) for name, path in settings.weights.items()
     }
     sheet = {}
     for fit in (fit for fit in settings.fits if fit.scene == scene and fit.seed == 0):
-        pairs = read_pairs(fit.renders(out))
+        pairs = read_pairs(fit.renders(settings.out))
         view = ViewToClean.of_pairs(pairs, len(pairs.truth) // 2)
         sheet[fit.kind] = {"truth": view.truth, "render": view.render} | {
             name: to_uint8(denoiser.clean(view.inputs)[0]) for name, denoiser in denoisers.items()

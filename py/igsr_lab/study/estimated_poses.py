@@ -13,7 +13,7 @@ from igsr.capture.photo_folder import Photo, load_photos
 from igsr.errors import IgsrError
 from igsr.geometry.pose_errors import pose_accuracy
 from igsr.pose.registry import ESTIMATORS
-from igsr_lab.markdown import cell, markdown_table
+from igsr_lab.report_parts import cell, markdown_table
 from igsr_lab.study.study import Row, Study
 
 SCENES = (
@@ -67,9 +67,6 @@ def poses(study: Study, *, scenes: tuple[str, ...] = SCENES, estimator: str = "c
     Returns:
         The content of ``study.json``: "runs", a row per scene and seed (see
         ``igsr.geometry.pose_errors``), and "protocol".
-
-    Raises:
-        IgsrError: an argument or a scene cannot be used.
     """
     if estimator not in ESTIMATORS:
         raise IgsrError(f"estimator must be {' or '.join(ESTIMATORS)}, not {estimator!r}.")

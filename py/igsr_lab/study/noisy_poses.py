@@ -20,9 +20,8 @@ from igsr.fitting.pose_refinement import refine_cameras
 from igsr.fitting.settings import Poses
 from igsr.geometry.camera_noise import AFFINE, MATRIX, TURN, Noise, noisy_view
 from igsr.geometry.pose_errors import pose_errors
-from igsr_lab.figures import save_figure
-from igsr_lab.markdown import markdown_table
 from igsr_lab.presets import preset_settings
+from igsr_lab.report_parts import markdown_table, new_figure, save_figure
 from igsr_lab.study.preset_fits import REFINED
 from igsr_lab.study.scoring import aligned_views
 from igsr_lab.study.study import Row, Study, deviation, seed_means, with_spread
@@ -70,9 +69,6 @@ def pose_noise(
     Returns:
         The content of ``study.json``: "summary", a row per noise and scene (and "mean" over
         scenes); "runs"; "protocol".
-
-    Raises:
-        IgsrError: an argument or a scene cannot be used, or a fit fails.
     """
     if not all(np.isfinite(size) and size > 0.0 for size in (noise, *turns)):
         raise IgsrError("noise and turns must be positive numbers.")
@@ -216,10 +212,8 @@ def _psnrs(scores: Row) -> str:
 
 def _plot(path: Path, report: Row) -> None:
     """PSNR by noise and cameras of the scored views, means over scenes."""
-    from matplotlib.figure import Figure
-
     lines = [line for line in report["summary"] if line["scene"] == "mean"]
-    figure = Figure(figsize=(2.0 + 2.2 * len(lines), 4.0), layout="constrained")
+    figure = new_figure(2.0 + 2.2 * len(lines), 4.0)
     axis = figure.subplots()
     for k, name in enumerate(FITS):
         for w, (way, marker) in enumerate(zip(WAYS, "vo^", strict=True)):

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from igsr_lab.figures import save_figure
-from igsr_lab.markdown import cell, markdown_table
+from igsr_lab.report_parts import cell, markdown_table, new_figure, save_figure
 from igsr_lab.study.study import (
     Row,
     Study,
@@ -240,11 +239,9 @@ def _usage_cell(parts: list[Row]) -> str:
 
 def _plot(path: Path, report: Row) -> None:
     """PSNR by scene and preset, and the paired differences."""
-    from matplotlib.figure import Figure
-
     scenes, found = list(report["scenes"]), report["differences"]
     panels = 1 if found is None else 2
-    figure = Figure(figsize=(2.0 + 1.1 * len(scenes) * panels, 4.2), layout="constrained")
+    figure = new_figure(2.0 + 1.1 * len(scenes) * panels, 4.2)
     axes = figure.subplots(1, panels, squeeze=False)[0]
     _plot_scores(axes[0], report)
     if found is not None:

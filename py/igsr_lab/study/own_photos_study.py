@@ -72,10 +72,6 @@ def own_photos(
         The content of ``study.json``: "runs", a row per scene, preset and seed; "cameras", a row
         per scene; "scenes" and "mean" with means and spreads; "differences" of two presets (see
         ``igsr_lab.study.own_photos_report``).
-
-    Raises:
-        IgsrError: there are no photos, an argument cannot be used, or a fit fails. A scene whose
-            cameras cannot be found is reported and left out.
     """
     for name, number in (("max_size", max_size), ("score_size", score_size), ("steps", steps)):
         if number is not None and number < 1:

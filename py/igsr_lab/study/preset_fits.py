@@ -17,9 +17,8 @@ from igsr.evaluation.scores import default_background, evaluate
 from igsr.fitting.fit_capture import fit_capture
 from igsr.fitting.pose_refinement import refine_cameras
 from igsr.fitting.result import FitResult
-from igsr_lab.figures import save_figure
-from igsr_lab.markdown import markdown_table
 from igsr_lab.presets import PRESETS, Preset, preset_keywords, preset_settings
+from igsr_lab.report_parts import markdown_table, new_figure, save_figure
 from igsr_lab.study.scoring import aligned_views
 from igsr_lab.study.splits import dtu_views, is_dtu, llff_views, with_train_views
 from igsr_lab.study.study import Row, Study, deviation, seed_means, with_spread
@@ -87,9 +86,6 @@ def blender8(
     Returns:
         The content of ``study.json``: "mean" by preset, with the standard deviation of each score
         over seeds; "scenes" by scene, views and preset; "runs"; "protocol".
-
-    Raises:
-        IgsrError: an argument or a scene cannot be used, or a fit fails.
     """
     unknown = [key for key in views if key not in VIEW_IDS]
     if unknown:
@@ -127,9 +123,6 @@ def few_photos(
 
     Returns:
         The content of ``study.json``, as ``blender8``; "protocol" names the fitted photos.
-
-    Raises:
-        IgsrError: an argument or a scene cannot be used, or a fit fails.
     """
     wrong = [count for count in views or () if not (count.isascii() and count.isdigit())]
     if wrong:
@@ -297,10 +290,8 @@ def table_lines(report: Row) -> list[str]:
 
 def _plot(path: Path, report: Row) -> None:
     """PSNR of every fit, by scene, views and preset."""
-    from matplotlib.figure import Figure
-
     groups, presets = _groups(report), list(report["mean"])
-    figure = Figure(figsize=(1.5 + 1.3 * len(groups), 4.0), layout="constrained")
+    figure = new_figure(1.5 + 1.3 * len(groups), 4.0)
     axis = figure.subplots()
     for k, preset in enumerate(presets):
         for g, (scene, views, summaries) in enumerate(groups):

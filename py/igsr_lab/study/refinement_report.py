@@ -10,8 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from igsr_lab.figures import save_figure, write_sheet
-from igsr_lab.markdown import cell, markdown_table
+from igsr_lab.report_parts import cell, markdown_table, new_figure, save_figure, write_sheet
 from igsr_lab.study.refinement_methods import Method
 from igsr_lab.study.refinement_runs import RefinementRun
 from igsr_lab.study.study import Row, deviation, difference_cell, standard_error
@@ -162,13 +161,11 @@ def _groups(report: Row) -> list[tuple[str, str, str, list[Row]]]:
 
 def plot_rounds(path: Path, report: Row) -> None:
     """Plot the PSNR of held-out views over the rounds, with a panel per scene and photos."""
-    from matplotlib.figure import Figure
-
     groups = _groups(report)
     panels = list(dict.fromkeys((scene, photos) for scene, photos, _, _ in groups))
     columns = min(4, len(panels))
     rows = -(-len(panels) // columns)
-    figure = Figure(figsize=(3.6 * columns + 0.4, 3.0 * rows + 0.3), layout="constrained")
+    figure = new_figure(3.6 * columns + 0.4, 3.0 * rows + 0.3)
     axes = figure.subplots(rows, columns, squeeze=False)
     for axis in axes.flat[len(panels) :]:
         axis.set_visible(False)

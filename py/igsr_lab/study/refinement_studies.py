@@ -82,9 +82,6 @@ def table2(
     """Refine from 10 localized and 10 scattered photos: the paper's Table 2.
 
     The paper's methods do one round and add 2 views; igsr's do two rounds.
-
-    Raises:
-        IgsrError: an argument or a scene cannot be used, or a fit fails.
     """
     kinds = [(scene, layout, 10) for scene in scenes for layout in ("localized", "scattered")]
     chosen = [
@@ -102,11 +99,7 @@ def table3(
     methods: tuple[str, ...] = ("absolute", "ours"),
     **options: Any,
 ) -> Row:
-    """Refine a real object from 4 localized photos by two rounds: the paper's Table 3.
-
-    Raises:
-        IgsrError: as ``table2``.
-    """
+    """Refine a real object from 4 localized photos by two rounds: the paper's Table 3."""
     kinds = [(scene, "localized", 4) for scene in scenes]
     chosen = [Method(name, name, MAX_SELECTED if name in OURS else 1, 2, True) for name in methods]
     title = "Table 3: two rounds, 4 localized photos"
@@ -120,11 +113,7 @@ def sweep(
     views: tuple[str, ...] = ("4", "6", "10", "15"),
     **options: Any,
 ) -> Row:
-    """Refine by four rounds of 1, 2 and 4 views without cross-validation, from scattered photos.
-
-    Raises:
-        IgsrError: as ``table2``, or a number in ``views`` is invalid.
-    """
+    """Refine by four rounds of 1, 2 and 4 views without cross-validation, from scattered photos."""
     if not views or not all(_is_number(text) for text in views):
         raise IgsrError(f"views must be numbers of photos, not {', '.join(views) or 'none'}.")
     kinds = [(scene, "scattered", int(text)) for scene in scenes for text in views]
@@ -150,9 +139,6 @@ def photographs(
         views: numbers of fitted photos, or "all".
         max_size: longest side of photos in pixels; None is the default of fits.
         options: see the module.
-
-    Raises:
-        IgsrError: as ``table2``, or a number in ``views`` is invalid.
     """
     if max_size is None:
         max_size = default_max_size(study.backend)
@@ -171,11 +157,7 @@ def refinement_ablation(
     methods: tuple[str, ...] = (*OURS, "improvement"),
     **options: Any,
 ) -> Row:
-    """Refine by one round without cross-validation, with one part left out at a time.
-
-    Raises:
-        IgsrError: as ``table2``.
-    """
+    """Refine by one round without cross-validation, with one part left out at a time."""
     kinds = [(scene, "even", ABLATION_PHOTOS.get(scene, 10)) for scene in scenes]
     chosen = [Method(name, name, MAX_SELECTED if name in OURS else 2, 1, False) for name in methods]
     return _refined(study, "One round, without parts of the refinement", kinds, chosen, options)

@@ -34,9 +34,6 @@ class Study:
         jobs: number of parallel runs, each in its own process with its share of the cores.
         on_run: called with (done, total, row) after each run.
         ray: execute runs on a Ray cluster instead (``pip install 'igsr[ray]'``).
-
-    Raises:
-        IgsrError: ``seeds`` or ``jobs`` is less than 1.
     """
 
     data: Path

@@ -1,8 +1,8 @@
-"""Write matplotlib figures and sheets of pictures as PNG."""
+"""Parts of reports: Markdown tables, matplotlib figures and sheets of pictures."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +18,24 @@ if TYPE_CHECKING:
 PICTURE_WIDTH_INCHES = 2.6
 
 
+def markdown_table(heads: Sequence[str], rows: Iterable[Sequence[object]], left: int) -> list[str]:
+    """Return the lines of a table; the first ``left`` columns are left-aligned."""
+    rule = [*["---"] * left, *["---:"] * (len(heads) - left)]
+    return [f"| {' | '.join(map(str, cells))} |" for cells in (heads, rule, *rows)]
+
+
+def cell(value: float | None, form: str) -> str:
+    """Format a number; None is "-"."""
+    return "-" if value is None else format(value, form)
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """A figure of a size in inches."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
 def save_figure(figure: Figure, path: Path, dpi: int = 120) -> None:
     """Write a figure."""
     with atomic_write(path) as temporary:
@@ -26,13 +44,10 @@ def save_figure(figure: Figure, path: Path, dpi: int = 120) -> None:
 
 def write_sheet(path: Path, rows: Mapping[str, Mapping[str, npt.NDArray[np.uint8]]]) -> None:
     """Write pictures, uint8 [H, W, 3], in labeled rows and columns."""
-    from matplotlib.figure import Figure
-
     first = next(iter(rows.values()))
     height, width = next(iter(first.values())).shape[:2]
     row_inches = PICTURE_WIDTH_INCHES * height / width + 0.05
-    size = (PICTURE_WIDTH_INCHES * len(first), row_inches * len(rows) + 0.2)
-    figure = Figure(figsize=size, layout="constrained")
+    figure = new_figure(PICTURE_WIDTH_INCHES * len(first), row_inches * len(rows) + 0.2)
     axes = figure.subplots(len(rows), len(first), squeeze=False)
     for line, (label, pictures) in zip(axes, rows.items(), strict=True):
         line[0].set_ylabel(label, fontsize=8)
