@@ -14,7 +14,7 @@ COMMANDS = {
     "bench": ("bench", "bench_command", "Measure speed and error of the backends."),
     "bench-check": (
         *("bench_check", "bench_check_command"),
-        "Compare this build's speed with that of a commit.",
+        "Compare this build's speed with another commit's.",
     ),
     "gpu-check": (
         *("gpu_check", "gpu_check_command"),

@@ -304,18 +304,21 @@ def test_unknown_memory_is_left_out(monkeypatch, tmp_path, is_on_device):
         monkeypatch.setattr(growth, "runs_on_cores", lambda backend: False)
     else:
         monkeypatch.setattr(peak_memory, "CLEAR_REFS", tmp_path / "nowhere" / "clear_refs")
-    point = growth.measure(0, 200, 32, "cpu", 0.0)
-    monkeypatch.setattr(growth, "measure_apart", lambda *arguments: point)
+    monkeypatch.setattr(growth, "in_a_process", lambda work, *arguments: work(*arguments))
     (row,) = growth.growth_rows("cpu", 0, [(200, 32)], 0.0)
     checked_row(row)
     assert not [name for name in row if "bytes" in name]
 
 
-def test_a_failing_child_has_a_row_with_the_reason(monkeypatch):
-    monkeypatch.setattr(sys, "executable", shutil.which("false"))
+@pytest.mark.parametrize("error", [IgsrError("It ended early."), RuntimeError("The GPU is lost.")])
+def test_a_failed_point_has_a_row_with_the_reason(monkeypatch, error):
+    def failing(*arguments):
+        raise error
+
+    monkeypatch.setattr(growth, "in_a_process", failing)
     (row,) = growth.growth_rows("cpu", 0, [(10, 16)], 0.0)
     assert "ms" not in row
-    assert "10 splats at 16 x 16 failed" in row["not_run"]
+    assert str(error) in row["not_run"]
 
 
 @pytest.mark.parametrize("error", [IgsrError("It ended early."), RuntimeError("The GPU is lost.")])

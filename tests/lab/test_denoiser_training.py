@@ -29,9 +29,13 @@ from igsr_lab.denoiser.losses import (
     squared_ratio,
     structure_ratio,
 )
-from igsr_lab.denoiser.pair_files import Pairs, read_pairs, write_pairs
-from igsr_lab.denoiser.pair_sets import validation_count
-from igsr_lab.denoiser.pairs import capture_of_pairs
+from igsr_lab.denoiser.pair_files import (
+    Pairs,
+    capture_of_pairs,
+    read_pairs,
+    validation_count,
+    write_pairs,
+)
 from igsr_lab.denoiser.perceptual_distance import SqueezeNetDistance, _Lpips, lpips_distance
 from igsr_lab.denoiser.train_network import CHECKPOINT, LOG, WEIGHTS, plot_training, train
 from igsr_lab.denoiser.training_settings import Training

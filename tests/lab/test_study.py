@@ -15,8 +15,6 @@ from ray_stand_in import stand_in_ray
 import igsr
 from igsr._internal.resumable_jobs import folder_hash
 from igsr.capture import Capture
-from igsr.fitting import presets
-from igsr_lab import presets as baselines
 from igsr_lab.presets import PRESETS, preset_settings
 from igsr_lab.study import Study, blender8, few_photos, preset_fits
 from igsr_lab.study.preset_fits import (
@@ -26,12 +24,19 @@ from igsr_lab.study.preset_fits import (
     load_blender8,
     load_few_photos,
     run_fit,
-    summarized,
 )
 from igsr_lab.study.splits import dtu_views, llff_views, with_train_views
+from igsr_lab.study.study import summarized
 
 #: Keywords of a preset that takes no time.
-SHORT = {"steps": 20, "max_splats": 300, "sh_degree": 0, "density": "fixed"}
+SHORT = {
+    "steps": 20,
+    "max_splats": 300,
+    "sh_degree": 0,
+    "density": "fixed",
+    "transients": "off",
+    "start": "random",
+}
 
 
 @pytest.fixture(scope="module")
@@ -119,8 +124,7 @@ def test_a_study_continues_after_an_interruption(data, tmp_path, monkeypatch):
 
 
 def test_photos_are_fitted_and_scored(data, monkeypatch):
-    short = replace(presets.settings_for(8), **SHORT, transients="off")
-    monkeypatch.setattr(presets, "_default", lambda *_: short)
+    monkeypatch.setattr(preset_fits, "preset_keywords", lambda preset, capture: SHORT)
     row = run_fit(load_blender8, str(data), Fit("ball", "76", "default", 1, "cpu"))
     assert row["psnr"] > 10.0
     assert row["splats"] <= 300
@@ -129,14 +133,11 @@ def test_photos_are_fitted_and_scored(data, monkeypatch):
 
 
 def test_spread_is_over_seeds_not_scenes():
-    rows = [
-        {"seed": seed, "psnr": psnr, "ssim": 1.0, "flip": 0.0, "splats": 1, "seconds": 1.0}
-        for seed, psnr in [(0, 10.0), (0, 30.0), (1, 12.0), (1, 32.0)]
-    ]
-    summary = summarized(rows)
-    assert summary["psnr"] == 21.0
-    assert summary["psnr_spread"] == pytest.approx(np.sqrt(2.0))
-    assert summarized(rows[:1])["psnr_spread"] is None
+    psnrs = [(0, 10.0), (0, 30.0), (1, 12.0), (1, 32.0)]
+    rows = [{"seed": seed, "psnr": psnr} for seed, psnr in psnrs]
+    summary = summarized(rows, ["psnr"])
+    assert summary == {"fits": 4, "psnr": 21.0, "psnr_spread": pytest.approx(np.sqrt(2.0))}
+    assert summarized(rows[:1], ["psnr"])["psnr_spread"] is None
 
 
 @pytest.mark.parametrize(
@@ -213,8 +214,8 @@ def test_few_photos_has_a_row_by_scene_views_and_preset(real, tmp_path, monkeypa
 
 
 def test_test_cameras_are_refined_for_presets_that_move_cameras(real, monkeypatch):
-    instantsplat = {**baselines._KEYWORDS["instantsplat"], **SHORT, "start": "random"}
-    monkeypatch.setitem(baselines._KEYWORDS, "instantsplat", instantsplat)
+    joint = {**SHORT, "poses": "joint"}
+    monkeypatch.setattr(preset_fits, "preset_keywords", lambda preset, capture: joint)
     fit = Fit("leaf", "3", "instantsplat", 0, "cpu")
     row = run_fit(load_few_photos, str(real), fit, refined=True)
     assert row["psnr_refined"] > row["psnr"]
@@ -222,7 +223,7 @@ def test_test_cameras_are_refined_for_presets_that_move_cameras(real, monkeypatc
 
 
 def test_masked_pixels_of_scored_photos_do_not_count(real, monkeypatch):
-    monkeypatch.setitem(baselines._KEYWORDS, "3dgs", {**baselines._KEYWORDS["3dgs"], **SHORT})
+    monkeypatch.setattr(preset_fits, "preset_keywords", lambda preset, capture: SHORT)
     mask = np.zeros((16, 16), dtype=bool)
     mask[3:13, 4:14] = True
 

@@ -178,16 +178,16 @@ def accuracy_page(report: dict[str, Any]) -> str:
         "",
         f"Measured with {machine_line(report['machine'])}. The scene: {first['splats']} splats of "
         f"about a pixel on {first['width']}×{first['height']}; {compared} of its "
-        f"{first['width'] * first['height']} pixels are compared, of which a line of the table "
-        f"leaves out at most {left_out}. Gradients are of a random loss over color, alpha and "
+        f"{first['width'] * first['height']} pixels are compared, and a line of the table leaves "
+        f"out at most {left_out} of them. Gradients are of a random loss over color, alpha and "
         "depth.",
         "",
         "## Arithmetic",
         "",
         "Each implementation against the f64 reference at the same setting, on the same f32 "
-        "splats. The reference's line compares the reference over all splats with the culled one that "
-        "is used here: culling only leaves out pairs that contribute nothing. Gradient errors are "
-        "relative to the largest of their kind, for the worst kind. A pixel of the "
+        "splats. The reference's line compares the reference over all splats with the culled one "
+        "that is used here: culling only leaves out pairs that contribute nothing. Gradient errors "
+        "are relative to the largest of their kind, for the worst kind. A pixel of the "
         "[band](numerics.md#bounds-and-what-is-measured) is left out only if it differs by more "
         f"than the bound, {max(BOUND_3D.values()):g}, or its transmittance by more than "
         f"{MIN_FLIP:g} of itself.",

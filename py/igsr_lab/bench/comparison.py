@@ -22,32 +22,23 @@ MIN_FLIP = 1e-3
 
 @dataclass(frozen=True)
 class Error:
-    """Difference from the reference.
+    """Difference from the reference."""
 
-    Attributes:
-        max: largest absolute difference; for gradients relative to the largest of their kind, of
-            the worst kind.
-        mean: the same for the mean.
-        where: the kind with the largest maximum, such as "v_means".
-    """
-
+    #: Largest absolute difference; for gradients relative to the largest of their kind, of the
+    #: worst kind.
     max: float
-    mean: float
-    where: str
+    mean: float  # the same for the mean
+    where: str  # the kind with the largest maximum, such as "v_means"
 
 
 @dataclass(frozen=True)
 class Band:
-    """Pixels at which an f32 implementation may differ.
+    """Pixels at which an f32 implementation may differ."""
 
-    Attributes:
-        pixels: their number, out of ``of``.
-        left_out: bool [H, W], those that differ by more than the bound or are flipped; they are not
-            compared.
-    """
-
-    pixels: int
+    pixels: int  # their number, out of ``of``
     of: int
+    #: bool [H, W], pixels that are not compared, as they differ by more than the bound or are
+    #: flipped.
     left_out: npt.NDArray[np.bool_]
 
 

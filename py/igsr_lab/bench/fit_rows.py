@@ -164,22 +164,16 @@ def charbonnier(picture: Tensor, photo: Tensor, mask: Tensor | None) -> Tensor:
 
 @dataclass(frozen=True)
 class Expected:
-    """The reference's gradients for a shot, and the error of a backend's picture.
+    """The reference's gradients for a shot, and the error of a backend's picture."""
 
-    Attributes:
-        gradients: of the loss.
-        gradients_from_picture: the same, with the loss's gradient at the backend's picture. This
-            leaves out the picture's rounding, which a loss with kinks like L1 amplifies.
-        picture: error of the backend's picture.
-        band: pixels that may differ, and those that do.
-        mask: bool [H, W], pixels whose loss counts: none at the kink of L1, and none whose SSIM
-            window has a pixel that is left out.
-    """
-
-    gradients: Arrays
+    gradients: Arrays  # of the loss
+    #: The same, with the loss's gradient at the backend's picture. This leaves out the picture's
+    #: rounding, which a loss with kinks like L1 amplifies.
     gradients_from_picture: Arrays
-    picture: Error
-    band: Band
+    picture: Error  # error of the backend's picture
+    band: Band  # number of pixels that may differ, and number that do
+    #: bool [H, W], pixels whose loss counts: none at the kink of L1, and none whose SSIM window has
+    #: a pixel that is left out.
     mask: npt.NDArray[np.bool_]
 
 
@@ -286,7 +280,7 @@ def _fit_gradients(shot: Shot, backend: str, mask: npt.NDArray[np.bool_]) -> Arr
 class CustomLoop:
     """A fit by ``igsr.rasterization``, torch's Adam and a Charbonnier loss.
 
-    Rates are constant, those of the fit, except a tenth for means and one rate for all of SH.
+    Rates are the fit's, constant, except a tenth for means and one rate for all of SH.
     """
 
     def __init__(

@@ -7,16 +7,13 @@ density does not depend on their number, the photo is noise.
 from __future__ import annotations
 
 import gc
-import json
-import os
-import subprocess
-import sys
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from igsr._internal.peak_memory import forget_peak, peak_bytes
+from igsr._internal.worker_processes import in_a_process
 from igsr.errors import IgsrError
 from igsr_lab.bench.comparison import errors_row, size_row
 from igsr_lab.bench.fit_rows import Shot, fit_step_ms, step_rows
@@ -34,7 +31,7 @@ SMALL_POINTS = ((10_000, 256), (30_000, 256), (10_000, 512))
 #: Splats and side for the comparison with the custom loop.
 PAIR = (20_000, 400)
 SH_DEGREE = 2
-#: Few enough splats that the memory is that of the picture's buffers.
+#: So few splats that the picture's buffers take almost all memory.
 EMPTY = 16
 #: Larger points do not run if a step takes longer.
 STEP_SECONDS = 20.0
@@ -61,11 +58,6 @@ def shot_of(seed: int, count: int, side: int) -> Shot:
 def parameter_bytes(count: int) -> int:
     """Size of the parameters: 11 numbers for shape and place, and the SH coefficients."""
     return 4 * count * (11 + 3 * (SH_DEGREE + 1) ** 2)
-
-
-def contract_bytes(count: int) -> int:
-    """2 x parameters + gradients + optimizer state, without the picture's buffers."""
-    return 5 * parameter_bytes(count)
 
 
 def measure(seed: int, count: int, side: int, backend: str, seconds: float) -> dict[str, Any]:
@@ -99,25 +91,6 @@ def evenly_chosen(crops: list[Any]) -> list[Any]:
     return [crops[i] for i in np.linspace(0, len(crops) - 1, CROPS).round().astype(int)]
 
 
-def measure_apart(
-    seed: int, count: int, side: int, backend: str, seconds: float = POINT_SECONDS
-) -> dict[str, Any]:
-    """``measure`` in a child process."""
-    arguments = json.dumps([seed, count, side, backend, seconds])
-    done = subprocess.run(
-        [sys.executable, "-m", "igsr_lab.bench.growth", arguments],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
-    )
-    if done.returncode != 0:
-        lines = done.stderr.strip().splitlines()
-        reason = lines[-1] if lines else f"it ended with status {done.returncode}"
-        raise IgsrError(f"A fit of {count} splats at {side} x {side} failed: {reason}")
-    row: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    return row
-
-
 def growth_rows(
     backend: str,
     seed: int,
@@ -139,17 +112,19 @@ def growth_rows(
             rows.append({**common, "not_run": reason})
             continue
         try:
-            row = measure_apart(seed, count, side, backend, seconds) | {"workload": name}
+            row = in_a_process(measure, seed, count, side, backend, seconds) | {"workload": name}
             if "peak_bytes" in row:
                 if side not in buffers:
-                    buffers[side] = measure_apart(seed, EMPTY, side, backend, 0.0)["peak_bytes"]
+                    empty = in_a_process(measure, seed, EMPTY, side, backend, 0.0)
+                    buffers[side] = empty["peak_bytes"]
                 row |= {
                     "image_bytes": buffers[side],
                     "bytes_per_splat": max(0, row["peak_bytes"] - buffers[side]) / count,
-                    "contract_bytes_per_splat": contract_bytes(count) / count,
+                    # 2 x parameters + gradients + optimizer state.
+                    "contract_bytes_per_splat": 5 * parameter_bytes(1),
                 }
-        except IgsrError as error:
-            rows.append({**common, "not_run": str(error)})
+        except (IgsrError, RuntimeError) as error:  # the GPU raises RuntimeError
+            rows.append({**common, "not_run": f"the fit failed: {error}"})
             continue
         rows.append(row)
         if row["ms"] > 1e3 * STEP_SECONDS:
@@ -160,7 +135,3 @@ def growth_rows(
 def pair_rows(backend: str, seed: int, seconds: float, pair: tuple[int, int] = PAIR) -> Any:
     """A step of the built-in fit and one of the custom loop, on W4's scene."""
     return step_rows("W4", [shot_of(seed, *pair)], backend, seconds)
-
-
-if __name__ == "__main__":
-    print(json.dumps(measure(*json.loads(sys.argv[1])), allow_nan=False))

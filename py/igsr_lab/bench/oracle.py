@@ -147,17 +147,11 @@ def band(projected: Arrays, chosen: list[Crop], shape: tuple[int, int], alpha_ba
 
 @dataclass(frozen=True)
 class PairCounts:
-    """Amount of work of a set of 2D splats.
+    """Amount of work of a set of 2D splats."""
 
-    Attributes:
-        tiles: (splat, 16x16 tile) pairs with at least one pixel at or above the alpha threshold.
-        pixels: (splat, pixel) pairs at or above the threshold.
-        blended: pairs of ``pixels`` that come before their pixel is opaque.
-    """
-
-    tiles: int
-    pixels: int
-    blended: int
+    tiles: int  # (splat, 16x16 tile) pairs with at least one pixel at or above the alpha threshold
+    pixels: int  # (splat, pixel) pairs at or above the threshold
+    blended: int  # pairs of ``pixels`` that come before their pixel is opaque
 
 
 def pair_counts(projected: Arrays, width: int, height: int) -> PairCounts:

@@ -27,7 +27,7 @@ MODEL_COUNTS = (20_000, 100_000)
 #: Name of W4 with few points, for software drivers.
 SMALL = "W4 small"
 DOES_NOT_FIT = "the reference does not fit"
-#: Keys of every row, including those of workloads that did not run.
+#: Keys of every row, also of workloads that did not run.
 COLUMNS: dict[str, Any] = dict.fromkeys(
     (
         *("workload", "backend", "pass", "splats", "width", "height"),
@@ -38,27 +38,16 @@ COLUMNS: dict[str, Any] = dict.fromkeys(
 
 @dataclass(frozen=True)
 class Settings:
-    """What to run.
+    """What to run."""
 
-    Attributes:
-        backends: resolved names.
-        workloads: some of ``WORKLOADS``.
-        garden: gsplat's ``test_garden.npz``, for W2.
-        capture: photos for W3.
-        models: folder of W3's fitted models.
-        seed: random seed of the workloads.
-        seconds: time that each row is repeated.
-        small: whether W4 has a few small points only.
-    """
-
-    backends: tuple[str, ...]
-    workloads: tuple[str, ...] = WORKLOADS
-    garden: Path | None = None
-    capture: Path | None = None
-    models: Path = Path("out/bench")
-    seed: int = 0
-    seconds: float = SECONDS
-    small: bool = False
+    backends: tuple[str, ...]  # resolved names
+    workloads: tuple[str, ...] = WORKLOADS  # some of ``WORKLOADS``
+    garden: Path | None = None  # gsplat's ``test_garden.npz``, for W2
+    capture: Path | None = None  # photos for W3
+    models: Path = Path("out/bench")  # folder of W3's fitted models
+    seed: int = 0  # random seed of the workloads
+    seconds: float = SECONDS  # time that each row is repeated
+    small: bool = False  # whether W4 has a few small points only
 
 
 def not_run(workload: str, backend: str, reason: str, splats: int | None = None) -> Row:

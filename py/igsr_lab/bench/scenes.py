@@ -25,29 +25,18 @@ PARAMETERS = ("means", "quats", "scales", "opacities", "colors")
 
 @dataclass(frozen=True)
 class Scene:
-    """Splats in front of one camera.
+    """Splats in front of one camera."""
 
-    Attributes:
-        splats: means [N, 3], quats [N, 4], scales [N, 3], opacities [N], colors [N, 3] or
-            [N, K, 3], float32.
-        sh_degree: degree of ``colors``, or None if they are RGB.
-        raw_parameters: whether scales are logarithms and opacities logits.
-        viewmat: [4, 4] world-to-camera.
-        intrinsics: [4] fx, fy, cx, cy.
-        width, height: picture size in pixels.
-        background: [3] RGB.
-        antialiased: whether opacities are reduced by the blur.
-    """
-
+    #: means [N, 3], quats [N, 4], scales [N, 3], opacities [N], colors [N, 3] or [N, K, 3], float32
     splats: Arrays
-    sh_degree: int | None
-    raw_parameters: bool
-    viewmat: npt.NDArray[np.float64]
-    intrinsics: npt.NDArray[np.float64]
-    width: int
+    sh_degree: int | None  # degree of ``colors``, or None if they are RGB
+    raw_parameters: bool  # whether scales are logarithms and opacities logits
+    viewmat: npt.NDArray[np.float64]  # [4, 4] world-to-camera
+    intrinsics: npt.NDArray[np.float64]  # [4] fx, fy, cx, cy
+    width: int  # picture size in pixels
     height: int
-    background: npt.NDArray[np.float32]
-    antialiased: bool = False
+    background: npt.NDArray[np.float32]  # [3] RGB
+    antialiased: bool = False  # whether opacities are reduced by the blur
 
     def arrays(self, dtype: Any) -> tuple[Any, Any, Any, Any, Any]:
         """The parameters as arguments of ``_core.project``."""

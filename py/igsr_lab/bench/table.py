@@ -109,7 +109,7 @@ def not_run_lines(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def print_report(console: Console, report: dict[str, Any]) -> None:
-    """Print the rows, those that did not run, and the protocol."""
+    """Print the rows, the workloads that did not run, and the protocol."""
     rows = [_cells(row) for row in report["rows"] if row["ms"] is not None]
     _print(console, report, HEADINGS, rows, not_run_lines(report["rows"]))
 

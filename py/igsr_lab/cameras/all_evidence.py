@@ -2,10 +2,10 @@
 
     python -m igsr_lab.cameras.all_evidence CAPTURE [CAPTURE ...] [--size 384] [--seed 0]
 
-Captures have true cameras; depths are those in ``depth/train`` of synthetic captures, else of the
-nearest of COLMAP's points. There is a line for each way to find cameras: COLMAP, the network, both
-as ``--estimator da3``, bundle adjustment although COLMAP places all photos, and the same with wrong
-depths of one photo. Errors are those of the study ``poses``.
+Captures have true cameras. Depths are read from ``depth/train`` of synthetic captures, else they
+are the nearest of COLMAP's points. A line is printed for each way to find cameras: COLMAP, the
+network, both as ``--estimator da3``, bundle adjustment although COLMAP places all photos, and the
+same with wrong depths of one photo. Errors are measured as in the study ``poses``.
 """
 
 from __future__ import annotations

@@ -24,21 +24,13 @@ HIGH_CONFIDENCE, LOW_CONFIDENCE = 4.0, 1.5
 
 @dataclass(frozen=True)
 class Noise:
-    """Errors of the network.
+    """Errors of the network."""
 
-    Attributes:
-        depth: standard deviation of the logarithm of depths, per photo and per cell.
-        rotation: rotation of every camera about a random axis, degrees.
-        center: shift of every camera, in units of the median depth.
-        focal: standard deviation of the logarithm of focal lengths.
-        wrong_confidence: fraction of the cells with a wrong depth of high confidence.
-    """
-
-    depth: float = 0.02
-    rotation: float = 1.0
-    center: float = 0.02
-    focal: float = 0.02
-    wrong_confidence: float = 0.05
+    depth: float = 0.02  # standard deviation of the logarithm of depths, per photo and per cell
+    rotation: float = 1.0  # rotation of every camera about a random axis, degrees
+    center: float = 0.02  # shift of every camera, in units of the median depth
+    focal: float = 0.02  # standard deviation of the logarithm of focal lengths
+    wrong_confidence: float = 0.05  # fraction of the cells with a wrong depth of high confidence
 
 
 class NoisyNetwork:

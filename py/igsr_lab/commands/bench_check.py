@@ -1,4 +1,4 @@
-"""``python -m igsr_lab bench-check``: compare this build's speed with that of a commit.
+"""``python -m igsr_lab bench-check``: compare this build's speed with another commit's.
 
 The commit is built in a temporary git worktree; ``bench --compare`` then runs both builds in turns.
 """
@@ -48,7 +48,7 @@ def bench_check_command(
         str, typer.Argument(metavar="COMMIT", help="The commit to compare with.")
     ] = "HEAD~1",
 ) -> None:
-    """Compare this build with that of COMMIT; the exit status is 1 if a row takes 10 % longer."""
+    """Compare this build with COMMIT's; the exit status is 1 if a row takes 10 % longer."""
     with tempfile.TemporaryDirectory() as folder:
         old = build_of(commit, Path(folder))
         words = ["bench", "--backend", "cpu", "--compare", str(old)]

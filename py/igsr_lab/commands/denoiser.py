@@ -91,7 +91,8 @@ def pairs_command(
 
     Finished fits are kept in --out; the same command continues from there.
     """
-    from igsr_lab.denoiser.pairs import DEFAULT_RECIPES, make_pairs
+    from igsr_lab.denoiser.pair_files import DEFAULT_RECIPES
+    from igsr_lab.denoiser.pairs import make_pairs
 
     with error_messages(
         lambda: "Interrupted; finished fits are kept, the same command continues from there."

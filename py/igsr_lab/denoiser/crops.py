@@ -28,31 +28,21 @@ _NORMAL_X, _NORMAL_Y = COLOR + 3, COLOR + 4
 
 
 class Crop(NamedTuple):
-    """One crop of one pair.
+    """One crop of one pair."""
 
-    Attributes:
-        inputs: float32 [``CHANNELS``, H, W], input of the network.
-        truth: float32 [4, H, W], the photo's colors in [0, 1], and 1 for known pixels. Unknown
-            pixels have the render's colors.
-    """
-
-    inputs: Tensor
+    inputs: Tensor  # float32 [``CHANNELS``, H, W], input of the network
+    #: float32 [4, H, W], the photo's colors in [0, 1], and 1 for known pixels. Unknown pixels have
+    #: the render's colors.
     truth: Tensor
 
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Crops on the training device.
+    """Crops on the training device."""
 
-    Attributes:
-        inputs: float32 [B, ``CHANNELS``, H, W], channels last in memory.
-        truth: float32 [B, 3, H, W] in [0, 1].
-        known: bool [B, 1, H, W], pixels with a known truth.
-    """
-
-    inputs: Tensor
-    truth: Tensor
-    known: Tensor
+    inputs: Tensor  # float32 [B, ``CHANNELS``, H, W], channels last in memory
+    truth: Tensor  # float32 [B, 3, H, W] in [0, 1]
+    known: Tensor  # bool [B, 1, H, W], pixels with a known truth
 
 
 def draw_batch(

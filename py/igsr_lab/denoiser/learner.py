@@ -24,11 +24,7 @@ MAX_GRADIENT_NORM = 1.0
 
 
 class Processes:
-    """The processes that torchrun started, or this one alone.
-
-    Args:
-        device: torch's name of the device; "cuda" is this process's GPU.
-    """
+    """The processes that torchrun started, or this one; device "cuda" is this process's GPU."""
 
     def __init__(self, device: str) -> None:
         self.count = int(os.environ.get("WORLD_SIZE", "1"))
@@ -62,17 +58,9 @@ class Processes:
 
 
 class Learner:
-    """A network in training.
+    """A network in training, with the discriminator of its loss.
 
-    Args:
-        network: with its initial weights.
-        loss: the loss; its discriminator is trained, too.
-        training: steps, rate and seed.
-        processes: that train together.
-
-    Attributes:
-        averaged: the network with the moving average of the weights, which is kept.
-        step: number of steps done.
+    ``averaged`` has the moving average of its weights, ``step`` is the number of steps done.
     """
 
     def __init__(

@@ -15,7 +15,7 @@ from igsr.errors import IgsrError
 from igsr_lab.denoiser.perceptual_distance import Distance
 from igsr_lab.denoiser.training_settings import LOSSES
 
-#: Weights of the default loss's parts; that of the squared error's ratio is 1.
+#: Weights of the default loss's parts; the squared error's ratio has weight 1.
 STRUCTURE_WEIGHT = 1.0
 PERCEPTUAL_WEIGHT = 0.1
 LIKELIHOOD_WEIGHT = 0.1
@@ -36,19 +36,12 @@ PERCEPTUAL_EVERY = 3
 
 @dataclass(frozen=True)
 class Prediction:
-    """Output of the network for a batch, and its targets.
+    """Output of the network for a batch, and its targets."""
 
-    Attributes:
-        render: [B, 3, H, W] in [0, 1], the input.
-        image: [B, 3, H, W], the output; not clamped.
-        log_error: [B, 1, H, W], natural logarithm of the predicted absolute error.
-        truth: [B, 3, H, W] in [0, 1].
-    """
-
-    render: Tensor
-    image: Tensor
-    log_error: Tensor
-    truth: Tensor
+    render: Tensor  # [B, 3, H, W] in [0, 1], the input
+    image: Tensor  # [B, 3, H, W], the output; not clamped
+    log_error: Tensor  # [B, 1, H, W], natural logarithm of the predicted absolute error
+    truth: Tensor  # [B, 3, H, W] in [0, 1]
 
 
 def charbonnier(prediction: Prediction) -> Tensor:

@@ -1,8 +1,14 @@
-"""Training pairs: the network's input of renders in 8 bits, and the photos."""
+"""Files of training pairs, and sets of files for training and validation.
+
+A pair is the network's input of a render, in 8 bits, and the photo.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import os
+import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +29,15 @@ from igsr.splats import Splats
 
 Bytes = npt.NDArray[np.uint8]
 
-#: Channels of ``network_inputs`` in [-1, 2]; the others are in [0, 1].
+#: How fits are degraded: "sparse" has 3 to 16 photos; "underfit" stops early; "noise" has noise on
+#: its cameras; "paper" and "scattered" are the paper's recipes; "leave-one-out" leaves one photo of
+#: the capture out of each fit.
+DEFAULT_RECIPES = ("sparse", "underfit", "noise")
+RECIPES = (*DEFAULT_RECIPES, "paper", "scattered", "leave-one-out")
+#: Fraction of the files, the last by name, that is kept for validation.
+VALIDATION_FRACTION = 0.1
+
+#: Channels of ``network_inputs`` in [-1, 2]; all others are in [0, 1].
 _WIDE = np.zeros(CHANNELS, np.bool_)
 _WIDE[COLOR + 1 : COLOR + BUFFERS] = True
 SCALE = np.where(_WIDE, 3.0 / 255.0, 1.0 / 255.0).astype(np.float32)
@@ -34,18 +48,13 @@ assert float(85 * SCALE[COLOR + 1] + OFFSET[COLOR + 1]) == 0.0
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """The pairs of one fit, all of one size.
+    """The pairs of one fit, all of one size."""
 
-    Attributes:
-        inputs: uint8 [V, ``CHANNELS``, H, W]; times ``SCALE`` plus ``OFFSET`` is the output of
-            ``network_inputs``.
-        truth: uint8 [V, 3, H, W], the photos.
-        masks: bool [V, H, W], pixels with a known truth.
-    """
-
+    #: uint8 [V, ``CHANNELS``, H, W]; times ``SCALE`` plus ``OFFSET`` is the output of
+    #: ``network_inputs``.
     inputs: Bytes
-    truth: Bytes
-    masks: npt.NDArray[np.bool_]
+    truth: Bytes  # uint8 [V, 3, H, W], the photos
+    masks: npt.NDArray[np.bool_]  # bool [V, H, W], pixels with a known truth
 
 
 def packed(inputs: npt.NDArray[np.float32]) -> Bytes:
@@ -128,3 +137,57 @@ def read_pairs(path: str | os.PathLike[str]) -> Pairs:
             f"{list(truth.shape)}; make them again"
         )
     return pairs
+
+
+def capture_of_pairs(path: str) -> str:
+    """Name of the capture of a file of pairs, or the name of a file of unknown origin."""
+    file = Path(path).name
+    found = re.fullmatch(rf"(.+)-(?:{'|'.join(RECIPES)})-\d+-seed\d+.*\.npz", file)
+    return file if found is None else found[1]
+
+
+@dataclass(frozen=True, eq=False)
+class PairSets:
+    """Pairs for training and validation, with the sorted names and the hash of all files."""
+
+    names: list[str]
+    sha256: str
+    train: list[Pairs]
+    validation: list[Pairs]
+
+
+def read_pair_sets(files: Sequence[str | os.PathLike[str]]) -> PairSets:
+    """Read files of pairs and keep a tenth of them, in whole captures, for validation."""
+    # By captures first, as one name may begin with another.
+    paths = sorted((str(path) for path in files), key=lambda path: (capture_of_pairs(path), path))
+    if len(paths) < 2:
+        raise IgsrError("training needs at least two files of pairs, one of them to validate on.")
+    kept = validation_count(paths)
+    train, validation = ([read_pairs(p) for p in part] for part in (paths[:-kept], paths[-kept:]))
+    return PairSets([Path(path).name for path in paths], _sha256(paths), train, validation)
+
+
+def validation_count(paths: Sequence[str]) -> int:
+    """Number of files at the end to keep, so that no capture is in both sets.
+
+    Warns if all pairs are of one capture; its last files are kept then.
+    """
+    captures = [capture_of_pairs(path) for path in paths]
+    kept = max(1, round(VALIDATION_FRACTION * len(paths)))
+    if len(set(captures)) == 1:
+        warnings.warn(
+            "All pairs are of one capture: validation uses the scene that is trained on.",
+            stacklevel=4,
+        )
+        return kept
+    while kept < len(paths) and captures[-kept - 1] == captures[-kept]:
+        kept += 1
+    # If the tenth reaches into the first capture, only the last one is kept.
+    return kept if kept < len(paths) else captures.count(captures[-1])
+
+
+def _sha256(paths: Sequence[str]) -> str:
+    digest = hashlib.sha256()
+    for path in paths:
+        digest.update(hashlib.sha256(Path(path).read_bytes()).digest())
+    return digest.hexdigest()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -22,14 +21,16 @@ from igsr.evaluation.scores import WHITE
 from igsr.fitting.fingerprint import fingerprint
 from igsr.fitting.fit_capture import fit_capture
 from igsr.geometry.camera_noise import AFFINE, MATRIX, TURN, Noise, noise_unit, noisy_view
-from igsr_lab.denoiser.pair_files import Pairs, check_one_size, rendered_pairs, write_pairs
+from igsr_lab.denoiser.pair_files import (
+    DEFAULT_RECIPES,
+    RECIPES,
+    Pairs,
+    check_one_size,
+    rendered_pairs,
+    write_pairs,
+)
 from igsr_lab.presets import PAPER_STEPS, preset_settings
 
-#: How fits are degraded: "sparse" has 3 to 16 photos; "underfit" stops early; "noise" has noise on
-#: its cameras; "paper" and "scattered" are the paper's recipes; "leave-one-out" leaves one photo of
-#: the capture out of each fit.
-DEFAULT_RECIPES = ("sparse", "underfit", "noise")
-RECIPES = (*DEFAULT_RECIPES, "paper", "scattered", "leave-one-out")
 #: Numbers of photos of "sparse" and "underfit" fits.
 FEW = (3, 4, 5, 6, 8, 9, 12, 16)
 #: Number of photos by recipe, as in the paper.
@@ -46,16 +47,11 @@ FITTED_RENDERED = 1
 
 @dataclass(frozen=True)
 class PairFit:
-    """One fit, with the options of ``make_pairs``; its pairs depend on nothing else.
+    """One fit, with the options of ``make_pairs``; its pairs depend on nothing else."""
 
-    Attributes:
-        capture: absolute path of the capture.
-        number: of the fit within its capture and recipe; of the photo for "leave-one-out".
-    """
-
-    capture: str
+    capture: str  # absolute path of the capture
     recipe: str
-    number: int
+    number: int  # of the fit within its capture and recipe; of the photo for "leave-one-out"
     views: int
     steps: int | None
     seed: int
@@ -83,12 +79,6 @@ class _Plan:
     steps: int | None
     noise: Noise | None = None
     note: tuple[tuple[str, str], ...] = ()
-
-
-def capture_of_pairs(file: str) -> str:
-    """Name of the capture of a file of pairs; the file's name if it is not one of ``PairFit``."""
-    found = re.fullmatch(rf"(.+)-(?:{'|'.join(RECIPES)})-\d+-seed\d+.*\.npz", file)
-    return file if found is None else found[1]
 
 
 def make_pairs(
@@ -185,7 +175,7 @@ def _run_fit(out: Path, data: str, fit: PairFit) -> dict[str, Any]:
         backend=fit.backend,
         seed=fit.seed + fit.number,
         steps=plan.steps,
-        # With exact depths of rendered captures, fits would be better than those of photos.
+        # With exact depths of rendered captures, fits would be better than fits of photos.
         depth_weight=0.0,
         backdrop=False,  # holes must be visible
     )

@@ -1,7 +1,7 @@
 """Perceptual distances: LPIPS, or distances of SqueezeNet's features if LPIPS cannot be used.
 
 LPIPS (Zhang et al. 2018, v0.1) weights the features of a torchvision backbone by calibrated heads;
-torchmetrics has the heads, torchvision downloads the backbone. The other distance is that of the
+torchmetrics has the heads, torchvision downloads the backbone. The other distance compares
 features of a fixed, ImageNet-trained SqueezeNet 1.0 (Iandola et al. 2016), read from a file. It has
 no calibrated heads and is not LPIPS.
 """

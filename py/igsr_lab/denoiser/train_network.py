@@ -26,7 +26,7 @@ from igsr.errors import IgsrError
 from igsr_lab.denoiser.crops import Crop, draw_batch, stacked, validation_crops
 from igsr_lab.denoiser.learner import Learner, Processes
 from igsr_lab.denoiser.losses import Loss, Prediction, charbonnier, regret
-from igsr_lab.denoiser.pair_sets import PairSets, read_pair_sets
+from igsr_lab.denoiser.pair_files import PairSets, read_pair_sets
 from igsr_lab.denoiser.perceptual_distance import Distance, distance_name
 from igsr_lab.denoiser.training_settings import Training
 from igsr_lab.report_parts import new_figure, save_figure
@@ -61,7 +61,7 @@ def train(
     Under torchrun, each process takes its share of every batch.
 
     Args:
-        pairs: files of ``make_pairs``; a tenth of them, those of the last captures by name, are
+        pairs: files of ``make_pairs``; a tenth of them, from the last captures by name, are
             kept for validation. A single capture gives a warning.
         out: folder for ``denoiser.safetensors``, ``log.jsonl``, ``checkpoint.pt`` and, if
             tensorboard is installed (``pip install 'igsr[tensorboard]'``), ``tensorboard/``.
@@ -128,7 +128,7 @@ def train(
 
 
 def is_first_process() -> bool:
-    """Whether this is the process that writes, of those that torchrun started."""
+    """Whether this process is the first one of torchrun, which writes the files."""
     return int(os.environ.get("RANK", "0")) == 0
 
 
@@ -204,13 +204,8 @@ def _psnr(image: Tensor, truth: Tensor) -> Tensor:
 class TrainingFiles:
     """Log and checkpoint of a training, and its time.
 
-    Args:
-        out: folder of the files.
-        about: what the result depends on; a checkpoint of another training is refused.
-        steps: total number of steps.
-        progress: called with an event for each row of the log.
-        resume: whether to continue from a checkpoint.
-        writes: whether this process writes files and reports progress.
+    ``about`` identifies the training: a checkpoint of another one is refused. ``writes`` is whether
+    this process writes files and reports progress.
     """
 
     def __init__(
@@ -322,7 +317,7 @@ def plot_training(log: Path, path: Path) -> list[dict[str, Any]]:
     except (OSError, ValueError) as error:
         raise IgsrError(f"{log} cannot be read ({error}); train again.") from error
     names = list(dict.fromkeys(key for row in rows for key in row))
-    # Baselines share the axis of their score, and validation that of training.
+    # Baselines share the axis of their score, and validation shares the axis of training.
     drawn = [
         name
         for name in names

@@ -9,7 +9,7 @@ from igsr._internal.settings import about, validate
 from igsr.denoiser.architecture import MULTIPLE
 from igsr.errors import IgsrError
 
-#: The default and the paper's three ("gan" and those with "lpips"); see ``losses.Loss``.
+#: The default and the paper's three ("gan" and two with "lpips"); see ``losses.Loss``.
 LossName = Literal["default", "charbonnier", "gan", "gan+lpips", "lpips"]
 LOSSES: tuple[str, ...] = get_args(LossName)
 #: torch's generators take seeds of 64 bits; each step adds to a million times the seed.

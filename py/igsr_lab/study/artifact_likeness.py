@@ -1,4 +1,4 @@
-"""Similarity of the errors of two sets of renders: those of real captures and the training pairs.
+"""Similarity of the errors in renders of real captures and in training pairs.
 
 An error is a render minus the photo. Artifacts differ by scale: the share of the error's power in
 each octave of spatial frequency, and the share in the few worst pixels.
@@ -30,29 +30,23 @@ BRIGHTEST_ERROR = 96.0
 
 @dataclass(frozen=True)
 class Likeness:
-    """Distance between the errors of real and synthetic renders.
+    """Distance between the errors of real and synthetic renders."""
 
-    Attributes:
-        distance: octaves between the two sets; None if one has no render, here and below.
-        within: octaves between two halves of the synthetic files, the distance by chance.
-        noise: octaves between the real set and white noise, the distance of a wrong recipe.
-        real: median signature of the real set, by ``NAMES``; empty without renders.
-        synthetic: median signature of the synthetic set.
-        renders: number of renders of "real" and "synthetic".
-    """
-
+    #: Octaves between the two sets; None if one has no render, here and below.
     distance: float | None
+    #: Octaves between two halves of the synthetic files, the distance by chance.
     within: float | None
+    #: Octaves between the real set and white noise, the distance of a wrong recipe.
     noise: float | None
-    real: dict[str, float]
-    synthetic: dict[str, float]
-    renders: dict[str, int]
+    real: dict[str, float]  # median signature of the real set, by ``NAMES``; empty without renders
+    synthetic: dict[str, float]  # median signature of the synthetic set
+    renders: dict[str, int]  # number of renders of "real" and "synthetic"
 
 
 def signatures(pairs: Sequence[Pairs]) -> Float64:
     """One row per render: shares of the error's power by octave, and in the worst pixels.
 
-    Renders without errors are left out, and those with masks, whose edges would add frequencies.
+    Renders without errors are left out, and masked renders, whose edges would add frequencies.
     """
     rows = []
     for one in pairs:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -38,40 +36,6 @@ class Cleaning:
 
 
 @dataclass(frozen=True, eq=False)
-class Confidence:
-    """Predicted confidence and remaining error, over the renders of one fit.
-
-    Attributes:
-        pixels: [20], number of pixels by bins of ``CONFIDENCE_EDGES``.
-        confidence: [20], sum of their confidence.
-        error: [20], sum of their absolute color errors, in [0, 1].
-        mean_error: mean over views of the mean absolute error.
-        weighted_error: the same, with pixels weighted by confidence.
-    """
-
-    pixels: Float64
-    confidence: Float64
-    error: Float64
-    mean_error: float
-    weighted_error: float
-
-
-@dataclass(frozen=True, eq=False)
-class Cleaned:
-    """Mean scores of one denoiser on the renders of one fit, by ``SCORES``."""
-
-    scores: Scores
-    confidence: Confidence | None
-
-    @staticmethod
-    def of_row(row: Mapping[str, Any]) -> Cleaned:
-        """From the row of ``run_cleaning``."""
-        found = row.get("confidence")
-        confidence = None if found is None else Confidence(**found)
-        return Cleaned({name: row[name] for name in SCORES}, confidence)
-
-
-@dataclass(frozen=True, eq=False)
 class ViewToClean:
     """Render and photo, uint8 [H, W, 3]; mask of known pixels; the network's input."""
 
@@ -93,7 +57,12 @@ class ViewToClean:
 
 
 def run_cleaning(data: str, run: Cleaning) -> Row:
-    """Denoise and score the renders of one fit; return the row. ``data`` is unused."""
+    """Denoise and score the renders of one fit; ``data`` is unused.
+
+    Returns:
+        The row: mean ``SCORES``, "views" with the scores of each, and, with a denoiser,
+        "confidence" (see ``_ConfidenceBins``).
+    """
     pairs = read_pairs(run.pairs)
     denoiser = None if run.weights is None else NetworkDenoiser(load_network(run.weights))
     distance = None if run.features is None else SqueezeNetDistance(run.features)
@@ -145,7 +114,7 @@ def _picture(channels: Picture) -> Picture:
 
 
 class _ConfidenceBins:
-    """Sums over the pixels of all views, by their confidence."""
+    """Sums over the pixels of all views by bins of confidence: their number, confidence, error."""
 
     def __init__(self) -> None:
         self.pixels, self.confidence, self.error = np.zeros((3, len(CONFIDENCE_EDGES) - 1))
@@ -163,7 +132,7 @@ class _ConfidenceBins:
         self.weighted_errors += float(np.sum(confidence * error) / np.sum(confidence))
 
     def row(self) -> Row:
-        """The fields of ``Confidence`` for JSON."""
+        """The sums by bin, and the mean error of a view, also weighted by confidence."""
         return {
             "pixels": self.pixels.tolist(),
             "confidence": self.confidence.tolist(),

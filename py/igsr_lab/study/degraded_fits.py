@@ -123,7 +123,7 @@ def run_fit(out: Path, data: str, fit: DegradedFit) -> Row:
         backend=fit.backend,
         seed=fit.seed,
         steps=_steps(fit.kind),
-        # Few photos have depths, and those of rendered captures would help too much.
+        # Few photos have depths, and exact depths of rendered captures would help too much.
         depth_weight=0.0,
         backdrop=False,  # holes must be visible
     )

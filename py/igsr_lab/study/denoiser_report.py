@@ -12,31 +12,24 @@ from igsr.denoiser.confidence import HALF_CONFIDENCE_ERROR
 from igsr_lab.denoiser.perceptual_distance import SqueezeNetDistance
 from igsr_lab.report_parts import cell, markdown_table, new_figure, save_figure
 from igsr_lab.study.artifact_likeness import Likeness
-from igsr_lab.study.cleaned_renders import SCORES, Cleaned, Scores
+from igsr_lab.study.cleaned_renders import SCORES, Scores
 from igsr_lab.study.degraded_fits import FEW, NOISE, PAPER, SCORED_VIEWS, DegradedFit, described
 from igsr_lab.study.scoring import known_means
-from igsr_lab.study.study import Row
+from igsr_lab.study.study import SCORE_COLUMNS, Row
 
 #: Names of igsr's denoiser and of the renders themselves in tables.
 OURS, BEFORE = "igsr", "before"
 #: Columns of the table with their formats.
-COLUMNS = {
-    "psnr": ("PSNR", ".2f"),
-    "ssim": ("SSIM", ".4f"),
-    "ms_ssim": ("MS-SSIM", ".4f"),
-    "best_quarter": ("best quarter", ".2f"),
-    "flip": ("FLIP", ".4f"),
-    "perceptual": ("perceptual", ".4f"),
-}
+COLUMNS = SCORE_COLUMNS | {"best_quarter": ("best quarter, dB", ".2f")}
 
 
 @dataclass(frozen=True, eq=False)
 class ComparedFit:
-    """One degraded fit with its row, and scores by denoiser, including ``BEFORE`` and ``OURS``."""
+    """One degraded fit, its row, and the rows of ``run_cleaning`` by denoiser."""
 
     fit: DegradedFit
-    row: Mapping[str, object]
-    cleaned: Mapping[str, Cleaned]
+    row: Row
+    cleaned: Mapping[str, Row]
 
 
 def comparison_report(
@@ -74,7 +67,7 @@ def comparison_report(
         "mean": {name: of(None, some) for name, some in members.items() if some},
         "confidence": _confidence(compared),
         "runs": [
-            {**one.row, **{name: cleaned.scores for name, cleaned in one.cleaned.items()}}
+            one.row | {name: {key: row[key] for key in SCORES} for name, row in one.cleaned.items()}
             for one in compared
         ],
     }
@@ -83,7 +76,7 @@ def comparison_report(
 
 def _means_by_denoiser(compared: Sequence[ComparedFit]) -> Row:
     def mean(name: str) -> Scores:
-        return known_means([one.cleaned[name].scores for one in compared], SCORES)
+        return known_means([one.cleaned[name] for one in compared], SCORES)
 
     others = [name for name in compared[0].cleaned if name not in (BEFORE, OURS)]
     return {
@@ -95,19 +88,17 @@ def _means_by_denoiser(compared: Sequence[ComparedFit]) -> Row:
 
 def _confidence(compared: Sequence[ComparedFit]) -> Row:
     """Confidence of igsr's denoiser and the remaining error, over the bins that have pixels."""
-    found = [one.cleaned[OURS].confidence for one in compared]
-    fits = [one for one in found if one is not None]
+    fits = [one.cleaned[OURS]["confidence"] for one in compared]
     pixels, confidence, error = (
-        np.sum([getattr(one, name) for one in fits], axis=0)
-        for name in ("pixels", "confidence", "error")
+        np.sum([fit[name] for fit in fits], axis=0) for name in ("pixels", "confidence", "error")
     )
     filled = pixels > 0
     return {
         "confidence": (confidence[filled] / pixels[filled]).tolist(),
         "error": (error[filled] / pixels[filled]).tolist(),
         "pixels": pixels[filled].tolist(),
-        "mean_error": float(np.mean([one.mean_error for one in fits])),
-        "weighted_error": float(np.mean([one.weighted_error for one in fits])),
+        "mean_error": float(np.mean([fit["mean_error"] for fit in fits])),
+        "weighted_error": float(np.mean([fit["weighted_error"] for fit in fits])),
     }
 
 

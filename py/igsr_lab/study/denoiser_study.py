@@ -16,7 +16,7 @@ from igsr_lab.denoiser.pair_files import read_pairs
 from igsr_lab.denoiser.perceptual_distance import SqueezeNetDistance
 from igsr_lab.report_parts import write_sheet
 from igsr_lab.study.artifact_likeness import Likeness, likeness, plot_likeness
-from igsr_lab.study.cleaned_renders import Cleaned, Cleaning, ViewToClean, run_cleaning, to_uint8
+from igsr_lab.study.cleaned_renders import Cleaning, ViewToClean, run_cleaning, to_uint8
 from igsr_lab.study.degraded_fits import (
     DEFAULT_KINDS,
     FEW,
@@ -148,8 +148,8 @@ def _names(scenes: Sequence[str]) -> dict[str, str]:
     return {scene: scene.rsplit("/", 1)[-1] for scene in scenes}
 
 
-def _cleaned(settings: Comparison, name: str, weights: Path | None, jobs: int) -> list[Cleaned]:
-    """Scores of one denoiser (None: none) on all fits' renders."""
+def _cleaned(settings: Comparison, name: str, weights: Path | None, jobs: int) -> list[Row]:
+    """Rows of one denoiser (None scores the renders themselves) on all fits' renders."""
     out, features = settings.out, settings.features
     depends: dict[str, Any] = {
         "weights": None if weights is None else file_hash(weights),
@@ -169,12 +169,11 @@ def _cleaned(settings: Comparison, name: str, weights: Path | None, jobs: int) -
         )
         for fit in settings.fits
     ]
-    rows = finished_runs(out / "runs", runs, run_cleaning, "", jobs, None)
-    return [Cleaned.of_row(row) for row in rows]
+    return finished_runs(out / "runs", runs, run_cleaning, "", jobs, None)
 
 
 def _artifacts(settings: Comparison, scenes: Collection[str]) -> Likeness:
-    """Compare errors of renders from few photos with those of training pairs; plot them."""
+    """Compare and plot errors of renders from few photos and of training pairs."""
     real = [
         read_pairs(fit.renders(settings.out))
         for fit in settings.fits

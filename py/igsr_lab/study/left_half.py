@@ -1,8 +1,8 @@
 """The left-half protocol: find a photo's exposure on its left half, score its right half.
 
 Photos of unknown exposure cannot be scored as they are, and a color map fitted to the scored pixels
-would hide errors. NeRF in the Wild (Martin-Brualla et al. 2021) splits the photo; the 3x4 affine
-map is that of hierarchical 3D Gaussians (Kerbl et al. 2024).
+would hide errors. NeRF in the Wild (Martin-Brualla et al. 2021) splits the photo; hierarchical
+3D Gaussians (Kerbl et al. 2024) fit a 3x4 affine map, too.
 """
 
 from __future__ import annotations

@@ -2,42 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from igsr_lab.report_parts import cell, markdown_table, new_figure, save_figure
+from igsr_lab.report_parts import (
+    cell,
+    draw_psnr,
+    label_groups,
+    markdown_table,
+    new_figure,
+    save_figure,
+)
 from igsr_lab.study.study import (
+    SCORE_COLUMNS,
     Row,
     Study,
+    by_preset,
     deviation,
     difference_cell,
-    seed_means,
+    grouped,
     standard_error,
     with_spread,
 )
 
-#: Columns of the table of scores, with their formats.
-SCORES = {
-    "psnr": ("PSNR, dB", ".2f"),
-    "psnr_refined": ("refined PSNR, dB", ".2f"),
-    "ssim": ("SSIM", ".4f"),
-    "ms_ssim": ("MS-SSIM", ".4f"),
-    "flip": ("FLIP", ".4f"),
-    "cc_psnr": ("cc PSNR, dB", ".2f"),
-    "cc_ssim": ("cc SSIM", ".4f"),
-    "perceptual": ("perceptual", ".4f"),
-    "lh_psnr": ("left-half PSNR, dB", ".2f"),
-    "lh_ssim": ("left-half SSIM", ".4f"),
-    "train_psnr": ("train PSNR, dB", ".2f"),
-    "train_ssim": ("train SSIM", ".4f"),
-    "splats": ("splats", ".0f"),
-    "seconds": ("seconds", ".0f"),
-    "cpu_seconds": ("CPU seconds", ".0f"),
-    "peak_memory_bytes": ("peak, GiB", ".2f"),
-}
 #: Scores of held-out photos that are compared.
 COMPARED = (
     "psnr",
@@ -54,7 +44,7 @@ COMPARED = (
 )
 #: Figures of whole fits that are compared.
 COMPARED_FITS = ("train_psnr", "train_ssim", "splats", "seconds", "cpu_seconds")
-COLUMNS = {**SCORES, "ssim_refined": ("refined SSIM", ".4f")}
+COLUMNS = SCORE_COLUMNS | {"ssim_refined": ("refined SSIM", ".4f")}
 DIFFERENCES_TEXT = (
     "A photo's difference is the mean over seeds of its score after minus before. A scene's is the "
     "mean over its held-out photos, ± its standard error over them; in brackets the standard "
@@ -72,14 +62,13 @@ def write_report(
     ``cameras`` has the rows of scenes whose cameras were searched; of two presets, the first is
     "before".
     """
-    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+
     report = {
         "title": "Own photos, from cameras to scores",
         "protocol": protocol,
-        "mean": {one: _summary(_of(rows, preset=one)) for one in presets if rows},
+        "mean": by_preset(rows, SCORE_COLUMNS),
         "scenes": {
-            scene: {one: _summary(_of(rows, scene=scene, preset=one)) for one in presets}
-            for scene in scenes
+            scene: by_preset(same, SCORE_COLUMNS) for scene, same in grouped(rows, "scene").items()
         },
         "differences": differences(rows, *presets) if len(presets) == 2 and rows else None,
         "cameras": list(cameras.values()),
@@ -99,12 +88,9 @@ def differences(rows: list[Row], before: str, after: str) -> Row:
         seed; and "mean" by score: "mean" over scenes and its "error".
     """
     scenes: dict[str, Row] = {}
-    for scene in dict.fromkeys(row["scene"] for row in rows):
-        by_preset = (
-            sorted(_of(rows, scene=scene, preset=one), key=lambda row: int(row["seed"]))
-            for one in (before, after)
-        )
-        pairs = list(zip(*by_preset, strict=True))
+    for scene, same in grouped(rows, "scene").items():
+        fits = grouped(sorted(same, key=lambda row: int(row["seed"])), "preset")
+        pairs = list(zip(fits[before], fits[after], strict=True))
         of_scene: Row = {}
         for score in COMPARED:
             # By seed and photo; photos without the score are left out.
@@ -137,21 +123,6 @@ def differences(rows: list[Row], before: str, after: str) -> Row:
     return {"before": before, "after": after, "scenes": scenes, "mean": mean}
 
 
-def _of(rows: Iterable[Row], **values: Any) -> list[Row]:
-    return [row for row in rows if all(row[name] == value for name, value in values.items())]
-
-
-def _summary(rows: list[Row]) -> Row:
-    """Mean of each score over the rows, and its standard deviation over seeds."""
-    summary: Row = {"fits": len(rows)}
-    for score in SCORES:
-        known = [row for row in rows if row.get(score) is not None]
-        means = seed_means(known, lambda row, score=score: row[score])  # type: ignore[misc]
-        summary[score] = float(means.mean()) if len(means) else None
-        summary[f"{score}_spread"] = deviation(means)
-    return summary
-
-
 def table_lines(report: Row) -> list[str]:
     """Scores, differences, limits, usage and failures."""
     lines: list[str] = []
@@ -163,7 +134,8 @@ def table_lines(report: Row) -> list[str]:
         lines += ["", "## Limits of each scene", "", "Of the fit with seed 0.", ""]
         lines += [
             f"* {row['scene']}, {row['preset']}: {row['limit']['sentence']}"
-            for row in _of(report["runs"], seed=0)
+            for row in report["runs"]
+            if row["seed"] == 0
         ]
         lines += _usage_lines(report)
     failed = [row for row in report["cameras"] if row["failed"]]
@@ -174,7 +146,9 @@ def table_lines(report: Row) -> list[str]:
 
 
 def _score_lines(report: Row) -> list[str]:
-    names = [name for name in SCORES if any(row.get(name) is not None for row in report["runs"])]
+    names = [
+        name for name in SCORE_COLUMNS if any(row.get(name) is not None for row in report["runs"])
+    ]
     placed = {row["scene"]: f"{row['placed']} of {row['photos']}" for row in report["runs"]}
     rows = [
         [scene, placed.get(scene, "all"), preset, *(_score_cell(scores, n) for n in names)]
@@ -215,9 +189,8 @@ def _difference_lines(found: Row) -> list[str]:
 def _usage_lines(report: Row) -> list[str]:
     names = list(dict.fromkeys(name for row in report["runs"] for name in row["parts"]))
     rows = []
-    for scene, by_preset in report["scenes"].items():
-        for preset in by_preset:
-            same = _of(report["runs"], scene=scene, preset=preset)
+    for scene, of_scene in grouped(report["runs"], "scene").items():
+        for preset, same in grouped(of_scene, "preset").items():
             sizes = ["×".join(map(str, same[0][name])) for name in ("fit_size", "score_size")]
             parts = [[row["parts"][n] for row in same if n in row["parts"]] for n in names]
             rows.append([scene, preset, *sizes, *(_usage_cell(part) for part in parts)])
@@ -239,49 +212,25 @@ def _usage_cell(parts: list[Row]) -> str:
 
 def _plot(path: Path, report: Row) -> None:
     """PSNR by scene and preset, and the paired differences."""
-    scenes, found = list(report["scenes"]), report["differences"]
-    panels = 1 if found is None else 2
-    figure = new_figure(2.0 + 1.1 * len(scenes) * panels, 4.2)
+    by_scene = grouped(report["runs"], "scene").items()
+    groups = {scene: grouped(rows, "preset") for scene, rows in by_scene}
+    panels = 1 if report["differences"] is None else 2
+    figure = new_figure(2.0 + 1.1 * len(groups) * panels, 4.2)
     axes = figure.subplots(1, panels, squeeze=False)[0]
-    _plot_scores(axes[0], report)
-    if found is not None:
-        _plot_differences(axes[1], report)
+    draw_psnr(axes[0], groups)
+    axes[0].set_title(report["title"], fontsize=10)
+    if panels == 2:
+        _plot_differences(axes[1], groups, report["differences"])
     for axis in axes:
-        axis.set_xticks(range(len(scenes)), scenes, fontsize=8, rotation=20, ha="right")
-        axis.set_xlim(-0.5, len(scenes) - 0.5)
-        axis.grid(alpha=0.3, axis="y")
+        label_groups(axis, groups)
     save_figure(figure, path)
 
 
-def _plot_scores(axis: Any, report: Row) -> None:
-    presets = list(report["mean"])
-    for k, preset in enumerate(presets):
-        for g, scene in enumerate(report["scenes"]):
-            at = g + 0.5 * (k + 0.5) / len(presets) - 0.25
-            same = _of(report["runs"], scene=scene, preset=preset)
-            for name, marker, fill, label in (
-                ("psnr", "o", f"C{k}", preset),
-                ("train_psnr", "^", "none", f"{preset}, fitted photos"),
-            ):
-                values = [row[name] for row in same]
-                axis.plot(
-                    [at] * len(values), values, marker, color=f"C{k}", markerfacecolor=fill,
-                    alpha=0.7, label=label if g == 0 else None,
-                )  # fmt: skip
-    axis.set_ylabel("PSNR, dB; held-out photos filled")
-    axis.set_title(report["title"], fontsize=10)
-    axis.legend(fontsize=8)
-
-
-def _plot_differences(axis: Any, report: Row) -> None:
-    found = report["differences"]
-    for g, scene in enumerate(report["scenes"]):
-        pairs = zip(
-            *(_of(report["runs"], scene=scene, preset=one) for one in report["mean"]), strict=True
-        )
+def _plot_differences(axis: Any, groups: dict[str, dict[str, list[Row]]], found: Row) -> None:
+    for g, (scene, fits) in enumerate(groups.items()):
         each = [
             after["psnr"] - before["psnr"]
-            for first, second in pairs
+            for first, second in zip(*fits.values(), strict=True)
             for before, after in zip(first["views"], second["views"], strict=True)
         ]
         axis.plot([g] * len(each), each, "o", color="0.6", alpha=0.5, markersize=4)

@@ -50,13 +50,7 @@ class CameraRun:
 
 @dataclass(frozen=True)
 class OwnFit:
-    """One fit of a scene, with the options of ``own_photos``.
-
-    Attributes:
-        cameras: file of the found cameras; None if the scene has cameras.
-        splats: file for the splats.
-        sheet: file for the sheet of pictures, or None.
-    """
+    """One fit of a scene, with the options of ``own_photos``."""
 
     scene: str
     preset: Preset
@@ -68,9 +62,9 @@ class OwnFit:
     score_size: int
     features: str | None
     left_half: bool
-    cameras: str | None
-    splats: str
-    sheet: str | None
+    cameras: str | None  # file of the found cameras; None if the scene has cameras
+    splats: str  # file for the splats
+    sheet: str | None  # file for the sheet of pictures, or None
 
 
 def find_scene_cameras(data: str, run: CameraRun) -> Row:

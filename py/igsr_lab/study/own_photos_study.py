@@ -30,7 +30,7 @@ from igsr_lab.study.preset_fits import REFINED
 from igsr_lab.study.splits import HOLDOUT
 from igsr_lab.study.study import Row, Study
 
-#: Default longest side of scored photos, if that of fitted photos is not given either.
+#: Default longest side of scored photos, if neither longest side is given.
 SCORE_SIZE_PX = 1600
 
 

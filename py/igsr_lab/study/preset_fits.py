@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-
-import numpy as np
 
 from igsr._internal.choices import FitBackend
 from igsr._internal.resumable_jobs import Run
@@ -18,10 +16,16 @@ from igsr.fitting.fit_capture import fit_capture
 from igsr.fitting.pose_refinement import refine_cameras
 from igsr.fitting.result import FitResult
 from igsr_lab.presets import PRESETS, Preset, preset_keywords, preset_settings
-from igsr_lab.report_parts import markdown_table, new_figure, save_figure
+from igsr_lab.report_parts import (
+    draw_psnr,
+    label_groups,
+    markdown_table,
+    new_figure,
+    save_figure,
+)
 from igsr_lab.study.scoring import aligned_views
 from igsr_lab.study.splits import dtu_views, is_dtu, llff_views, with_train_views
-from igsr_lab.study.study import Row, Study, deviation, seed_means, with_spread
+from igsr_lab.study.study import SCORE_COLUMNS, Row, Study, by_preset, grouped, with_spread
 
 #: Indices into the train split of NeRF Synthetic, by few-view papers; codes based on 3DGS have 76
 #: instead of 75.
@@ -29,23 +33,11 @@ VIEW_IDS = {
     "75": (26, 86, 2, 55, 75, 93, 16, 73),
     "76": (26, 86, 2, 55, 76, 93, 16, 73),
 }
-#: Numbers of photos of ``few_photos``: those of LLFF's and DTU's protocols, and of a turntable,
-#: which needs more to go all round.
+#: Numbers of photos of ``few_photos``: LLFF's and DTU's protocols; a turntable needs more photos.
 FEW_VIEWS = ("3", "6", "9")
 TURNTABLE_VIEWS = ("3", "6", "12")
 #: Scores of each fit, kept in its row.
 SCORES = ("psnr", "ssim", "flip", "cc_psnr", "cc_ssim")
-#: Columns of the table with their formats; a study has some of them.
-COLUMNS = {
-    "psnr": ("PSNR, dB", ".2f"),
-    "psnr_refined": ("refined PSNR, dB", ".2f"),
-    "ssim": ("SSIM", ".4f"),
-    "flip": ("FLIP", ".4f"),
-    "cc_psnr": ("cc PSNR, dB", ".2f"),
-    "cc_ssim": ("cc SSIM", ".4f"),
-    "splats": ("splats", ".0f"),
-    "seconds": ("seconds a fit", ".0f"),
-}
 #: Description of refined cameras for protocols.
 REFINED = (
     "test cameras aligned to the fitted ones if those moved, then each fitted to its photo with "
@@ -228,88 +220,51 @@ def refined_psnr(result: FitResult, capture: Capture, backend: FitBackend) -> fl
     return float(evaluate(result.splats, refined, background=background, backend=backend)["psnr"])
 
 
-def summarized(rows: list[Row]) -> Row:
-    """Mean of each score over the rows, and its standard deviation over seeds."""
-    summary: Row = {"fits": len(rows)}
-    for score in (score for score in COLUMNS if all(score in row for row in rows)):
-        means = seed_means(rows, lambda row, score=score: row[score])  # type: ignore[misc]
-        summary[score] = float(np.mean(means))
-        summary[f"{score}_spread"] = deviation(means)
-    return summary
-
-
 def write_report(study: Study, title: str, rows: list[Row], protocol: Row) -> Row:
     """Write the study's files; return the content of ``study.json``."""
-    presets = dict.fromkeys(row["preset"] for row in rows)
-    scenes: dict[str, Row] = {}
-    for scene, views in dict.fromkeys((row["scene"], row["views"]) for row in rows):
-        same = [row for row in rows if (row["scene"], row["views"]) == (scene, views)]
-        scenes.setdefault(scene, {})[views] = _by_preset(same, presets)
+    scores = [name for name in SCORE_COLUMNS if name in rows[0]]
+    groups = {
+        (scene, views): same
+        for scene, of_scene in grouped(rows, "scene").items()
+        for views, same in grouped(of_scene, "views").items()
+    }
+    scenes: Row = {}
+    for (scene, views), same in groups.items():
+        scenes.setdefault(scene, {})[views] = by_preset(same, scores)
     report = {
         "title": title,
         "protocol": protocol,
-        "mean": _by_preset(rows, presets),
+        "mean": by_preset(rows, scores),
         "scenes": scenes,
         "runs": rows,
     }
-    _plot(study.out / "study.png", report)
+    figure = new_figure(1.5 + 1.3 * len(groups), 4.0)
+    axis = figure.subplots()
+    dots = {", ".join(key): grouped(same, "preset") for key, same in groups.items()}
+    draw_psnr(axis, dots)
+    label_groups(axis, dots)
+    axis.set_title(title, fontsize=10)
+    save_figure(figure, study.out / "study.png")
     return study.write(report, table_lines)
-
-
-def _by_preset(rows: list[Row], presets: Iterable[str]) -> Row:
-    return {
-        preset: summarized([row for row in rows if row["preset"] == preset]) for preset in presets
-    }
-
-
-def _groups(report: Row) -> list[tuple[str, str, Row]]:
-    """Scene, views and the summaries by preset."""
-    return [
-        (scene, views, presets)
-        for scene, by_views in report["scenes"].items()
-        for views, presets in by_views.items()
-    ]
 
 
 def table_lines(report: Row) -> list[str]:
     """Mean ± spread over seeds of each score."""
-    names = [name for name in COLUMNS if name in next(iter(report["mean"].values()))]
+    names = [name for name in SCORE_COLUMNS if name in next(iter(report["mean"].values()))]
+    groups = [
+        (scene, views, presets)
+        for scene, by_views in report["scenes"].items()
+        for views, presets in by_views.items()
+    ]
     rows = [
         [
             scene,
             views,
             preset,
-            *(with_spread(scores[n], scores[f"{n}_spread"], COLUMNS[n][1]) for n in names),
+            *(with_spread(scores[n], scores[f"{n}_spread"], SCORE_COLUMNS[n][1]) for n in names),
         ]
-        for scene, views, presets in [*_groups(report), ("mean", "all", report["mean"])]
+        for scene, views, presets in [*groups, ("mean", "all", report["mean"])]
         for preset, scores in presets.items()
     ]
-    heads = ["scene", "views", "preset", *(COLUMNS[name][0] for name in names)]
+    heads = ["scene", "views", "preset", *(SCORE_COLUMNS[name][0] for name in names)]
     return markdown_table(heads, rows, left=3)
-
-
-def _plot(path: Path, report: Row) -> None:
-    """PSNR of every fit, by scene, views and preset."""
-    groups, presets = _groups(report), list(report["mean"])
-    figure = new_figure(1.5 + 1.3 * len(groups), 4.0)
-    axis = figure.subplots()
-    for k, preset in enumerate(presets):
-        for g, (scene, views, summaries) in enumerate(groups):
-            psnrs = [
-                row["psnr"]
-                for row in report["runs"]
-                if (row["scene"], row["views"], row["preset"]) == (scene, views, preset)
-            ]
-            at = g + 0.5 * (k + 0.5) / len(presets) - 0.25
-            axis.plot([at] * len(psnrs), psnrs, "o", color=f"C{k}", alpha=0.6)
-            mean = summaries[preset]["psnr"]
-            label = preset if g == 0 else None
-            axis.plot(at, mean, "_", markersize=16, markeredgewidth=2, color=f"C{k}", label=label)
-    labels = [f"{scene}\nviews {views}" for scene, views, _ in groups]
-    axis.set_xticks(range(len(groups)), labels, fontsize=8)
-    axis.set_xlim(-0.5, len(groups) - 0.5)
-    axis.set_ylabel("PSNR of held-out views, dB")
-    axis.set_title(report["title"], fontsize=10)
-    axis.grid(alpha=0.3, axis="y")
-    axis.legend(fontsize=9)
-    save_figure(figure, path)

@@ -32,21 +32,13 @@ METHODS = (*OURS, *PAPER)
 
 @dataclass(frozen=True)
 class Method:
-    """A refinement that continues from the first fit of a run.
+    """A refinement that continues from the first fit of a run."""
 
-    Attributes:
-        name: in tables and file names.
-        method: one of ``METHODS``.
-        views: maximum number of views added per round.
-        rounds: maximum number of rounds.
-        cross_validate: whether igsr's rounds are cross-validated; the paper's never are.
-    """
-
-    name: str
-    method: str
-    views: int
-    rounds: int
-    cross_validate: bool
+    name: str  # in tables and file names
+    method: str  # one of ``METHODS``
+    views: int  # maximum number of views added per round
+    rounds: int  # maximum number of rounds
+    cross_validate: bool  # whether igsr's rounds are cross-validated; the paper's never are
 
 
 def refine_keywords(
@@ -71,18 +63,23 @@ def refine_keywords(
     ours = {
         "denoiser": denoiser,
         "propose": novel_views,
-        "select": partial(_limited, method.views),
+        "select": lambda candidates, count: select_views(candidates, method.views),
         "cross_validate": method.cross_validate,
     }
     changes: dict[str, dict[str, Any]] = {
         "ours": {},
         "no-denoiser": {
             "denoiser": partial(_undenoised, denoiser),
-            "select": partial(_most_confident, method.views),
+            # Without denoising, no view has a gain.
+            "select": lambda candidates, count: sorted(
+                candidates, key=lambda candidate: -candidate.mean_confidence
+            )[: method.views],
         },
         "no-trust": {"denoiser": partial(_full_confidence, denoiser)},
-        "no-selection": {"select": partial(_first, method.views)},
-        "no-outward": {"propose": _between},
+        "no-selection": {"select": lambda candidates, count: list(candidates[: method.views])},
+        "no-outward": {
+            "propose": lambda *given: [view for view in novel_views(*given) if view.between]
+        },
     }
     return ours | changes[method.method]
 
@@ -99,25 +96,6 @@ def _full_confidence(
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
     picture, confidence = denoiser(buffers, photos)
     return picture, np.ones_like(confidence)
-
-
-def _limited(views: int, candidates: Sequence[Candidate], count: int) -> list[Candidate]:
-    return select_views(candidates, views)
-
-
-def _most_confident(views: int, candidates: Sequence[Candidate], count: int) -> list[Candidate]:
-    """Without denoising, no view has a gain."""
-    return sorted(candidates, key=lambda candidate: -candidate.mean_confidence)[:views]
-
-
-def _first(views: int, candidates: Sequence[Candidate], count: int) -> list[Candidate]:
-    return list(candidates[:views])
-
-
-def _between(
-    splats: Splats, known: Sequence[Camera], count: int, backend: FitBackend
-) -> list[NovelView]:
-    return [view for view in novel_views(splats, known, count, backend) if view.between]
 
 
 def _given_views(

@@ -13,15 +13,10 @@ from PIL import Image
 from igsr_lab.report_parts import cell, markdown_table, new_figure, save_figure, write_sheet
 from igsr_lab.study.refinement_methods import Method
 from igsr_lab.study.refinement_runs import RefinementRun
-from igsr_lab.study.study import Row, deviation, difference_cell, standard_error
+from igsr_lab.study.study import SCORE_COLUMNS, Row, deviation, difference_cell, standard_error
 
-#: Scores of the tables, with their headings and formats.
-COLUMNS = {
-    "psnr": ("PSNR, dB", ".2f"),
-    "ssim": ("SSIM", ".4f"),
-    "flip": ("FLIP", ".4f"),
-    "perceptual": ("perceptual", ".4f"),
-}
+#: Scores of the tables.
+SCORES = ("psnr", "ssim", "flip", "perceptual")
 GAINS_TEXT = (
     "Gain of the last accepted round over round 0, with its standard error over held-out views; "
     "in brackets the standard deviation over seeds:"
@@ -43,7 +38,7 @@ def summarized(rows: Sequence[Row]) -> Row:
             done = [run[min(number, len(run) - 1)] for run in runs]
             means: Row = {
                 name: float(np.mean([row[name] for row in done]))
-                for name in COLUMNS
+                for name in SCORES
                 if all(name in row for row in done)
             }
             for name in ("near", "far"):
@@ -72,7 +67,7 @@ def paired_gains(rows: Sequence[Row], method: str) -> dict[str, Row]:
     """
     runs = [row["methods"][method]["rounds"] for row in rows]
     gains: dict[str, Row] = {}
-    for name in COLUMNS:
+    for name in SCORES:
         if any(view.get(name) is None for run in runs for view in run[0]["views"]):
             continue
         by_view = np.array(
@@ -96,7 +91,7 @@ def paired_gains(rows: Sequence[Row], method: str) -> dict[str, Row]:
 def mean_gains(gains: Sequence[dict[str, Row]]) -> dict[str, Row]:
     """Mean gains over several choices of photos, with their standard errors."""
     means: dict[str, Row] = {}
-    for name in COLUMNS:
+    for name in SCORES:
         known = np.array([by_score[name]["gain"] for by_score in gains if name in by_score])
         if len(known):
             means[name] = {"gain": float(known.mean()), "standard_error": standard_error(known)}
@@ -106,20 +101,20 @@ def mean_gains(gains: Sequence[dict[str, Row]]) -> dict[str, Row]:
 def table_lines(report: Row) -> list[str]:
     """Scores after each round, gains, and the paper's figures."""
     groups = _groups(report)
-    names = [name for name in COLUMNS if name in groups[0][3][0]]
+    names = [name for name in SCORES if name in groups[0][3][0]]
     rows = [
         [
             *group,
             number,
             "" if number == 0 else f"{100.0 * row['accepted']:.0f} %",
-            *(format(row[name], COLUMNS[name][1]) for name in names),
+            *(format(row[name], SCORE_COLUMNS[name][1]) for name in names),
             *(cell(row[name], ".2f") for name in ("near", "far")),
         ]
         for *group, rounds in groups
         for number, row in enumerate(rounds)
     ]
     heads = ["scene", "photos", "method", "round", "accepted"]
-    heads += [*(COLUMNS[name][0] for name in names), "near, dB", "far, dB"]
+    heads += [*(SCORE_COLUMNS[name][0] for name in names), "near, dB", "far, dB"]
     lines = [*markdown_table(heads, rows, left=3), "", GAINS_TEXT, "", *_gain_lines(report)]
     if report["paper"]:
         lines += ["", PAPER_TEXT, "", *(f"* {row}" for row in report["paper"])]
@@ -128,7 +123,7 @@ def table_lines(report: Row) -> list[str]:
 
 def _gain_lines(report: Row) -> list[str]:
     means = report["mean_gains"]
-    names = [name for name in COLUMNS if all(name in gains for gains in means.values())]
+    names = [name for name in SCORES if all(name in gains for gains in means.values())]
     gains_of = [
         ([scene, photos, method], gains)
         for scene, by_photos in report["gains"].items()
@@ -140,12 +135,12 @@ def _gain_lines(report: Row) -> list[str]:
         if gain is None:
             return "-"
         error, seeds = gain["standard_error"], gain.get("seeds")
-        return difference_cell(gain["gain"], error, seeds, COLUMNS[name][1])
+        return difference_cell(gain["gain"], error, seeds, SCORE_COLUMNS[name][1])
 
     rows = [
         [*group, *(written(name, gains.get(name)) for name in names)] for group, gains in gains_of
     ]
-    heads = ["scene", "photos", "method", *(COLUMNS[name][0] for name in names)]
+    heads = ["scene", "photos", "method", *(SCORE_COLUMNS[name][0] for name in names)]
     return markdown_table(heads, rows, left=3)
 
 

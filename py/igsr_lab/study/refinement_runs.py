@@ -76,23 +76,14 @@ class RefinementRun:
 
 @dataclass(frozen=True)
 class RefinementSettings:
-    """What all runs of a study share.
+    """What all runs of a study share."""
 
-    Attributes:
-        out: folder of the study.
-        methods: continue from each fit.
-        weights: the denoiser's file; None is igsr's own.
-        features: SqueezeNet's arrays (.npz), for the perceptual distance, or None.
-        steps: of each fit; None is the default.
-        max_size: longest side of the photos in pixels; None keeps their size.
-    """
-
-    out: str
-    methods: tuple[Method, ...]
-    weights: str | None
-    features: str | None
-    steps: int | None
-    max_size: int | None = None
+    out: str  # folder of the study
+    methods: tuple[Method, ...]  # continue from each fit
+    weights: str | None  # the denoiser's file; None is igsr's own
+    features: str | None  # SqueezeNet's arrays (.npz), for the perceptual distance, or None
+    steps: int | None  # of each fit; None is the default
+    max_size: int | None = None  # longest side of the photos in pixels; None keeps their size
 
     @property
     def file_hashes(self) -> dict[str, str | None]:
@@ -107,8 +98,8 @@ def split(capture: Capture, run: RefinementRun) -> tuple[Capture, list[View], li
     """Choose the photos to fit, the held-out views, and the views that the paper may add.
 
     If the capture has test views, 15 evenly spaced ones are held out and the rest may be added.
-    Otherwise 7 evenly spaced photos (every 8th with layout "even", as LLFF) are held out and 6 of
-    those that are not fitted may be added.
+    Otherwise 7 evenly spaced photos (every 8th with layout "even", as LLFF) are held out and 6
+    photos that are not fitted may be added.
     """
     if capture.test_views:
         train, test = capture.train_views, capture.test_views
@@ -168,7 +159,7 @@ def run_refinement(settings: RefinementSettings, data: str, run: RefinementRun) 
 
 
 def _round_rows(refined: Refined, first: Row, scorer: _Scorer, out: Path) -> list[Row]:
-    """Scores after each round; a rejected round has those of the round before."""
+    """Scores after each round; a rejected round repeats the scores before it."""
     rows: list[Row] = [{**first, "splats": len(refined.first), "accepted": True}]
     for number, done in enumerate(refined.rounds, 1):
         row = rows[-1]

@@ -73,7 +73,7 @@ def _split(capture: Capture, train: Sequence[int], test: Sequence[int]) -> Captu
 
 
 def localized(cameras: Sequence[Camera], count: int) -> list[int]:
-    """Choose camera 0 and those with the most similar viewing directions."""
+    """Choose camera 0 and the cameras with the most similar viewing directions."""
     directions = _directions(cameras)
     return [int(i) for i in np.argsort(-(directions @ directions[0]), kind="stable")[:count]]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,26 @@ from igsr._internal.resumable_jobs import Run, finished_runs
 from igsr.errors import IgsrError
 
 Row = dict[str, Any]
+
+#: Headings and formats of scores in tables.
+SCORE_COLUMNS = {
+    "psnr": ("PSNR, dB", ".2f"),
+    "psnr_refined": ("refined PSNR, dB", ".2f"),
+    "ssim": ("SSIM", ".4f"),
+    "ms_ssim": ("MS-SSIM", ".4f"),
+    "flip": ("FLIP", ".4f"),
+    "cc_psnr": ("cc PSNR, dB", ".2f"),
+    "cc_ssim": ("cc SSIM", ".4f"),
+    "perceptual": ("perceptual", ".4f"),
+    "lh_psnr": ("left-half PSNR, dB", ".2f"),
+    "lh_ssim": ("left-half SSIM", ".4f"),
+    "train_psnr": ("train PSNR, dB", ".2f"),
+    "train_ssim": ("train SSIM", ".4f"),
+    "splats": ("splats", ".0f"),
+    "seconds": ("seconds", ".0f"),
+    "cpu_seconds": ("CPU seconds", ".0f"),
+    "peak_memory_bytes": ("peak, GiB", ".2f"),
+}
 
 
 @dataclass(frozen=True)
@@ -86,12 +106,34 @@ class Study:
         return report
 
 
+def grouped(rows: Sequence[Row], name: str) -> dict[Any, list[Row]]:
+    """Group rows by one of their values, in order of appearance."""
+    groups: dict[Any, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(row[name], []).append(row)
+    return groups
+
+
+def summarized(rows: Sequence[Row], scores: Iterable[str]) -> Row:
+    """Mean of each score over the rows that have it, and its deviation over seeds ("_spread")."""
+    summary: Row = {"fits": len(rows)}
+    for score in scores:
+        known = [row for row in rows if row.get(score) is not None]
+        means = seed_means(known, lambda row, score=score: row[score])  # type: ignore[misc]
+        summary[score] = float(means.mean()) if len(means) else None
+        summary[f"{score}_spread"] = deviation(means)
+    return summary
+
+
+def by_preset(rows: Sequence[Row], scores: Iterable[str]) -> Row:
+    """``summarized`` rows by preset."""
+    return {preset: summarized(same, scores) for preset, same in grouped(rows, "preset").items()}
+
+
 def seed_means(rows: Sequence[Row], value: Callable[[Row], float]) -> npt.NDArray[np.float64]:
     """Return the mean of a value over the rows of each seed."""
-    by_seed: dict[int, list[float]] = {}
-    for row in rows:
-        by_seed.setdefault(row["seed"], []).append(value(row))
-    return np.array([float(np.mean(values)) for values in by_seed.values()])
+    by_seed = grouped(rows, "seed").values()
+    return np.array([float(np.mean([value(row) for row in same])) for same in by_seed])
 
 
 def deviation(values: npt.NDArray[np.float64]) -> float | None:

@@ -16,17 +16,11 @@ _STEPS = np.array([0.7548776662466927, 0.5698402909980532])
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """A pinhole camera with square pixels and a centered principal point.
+    """A pinhole camera with square pixels and a centered principal point."""
 
-    Attributes:
-        camera_to_world: float64 [4, 4], OpenGL axes (x right, y up, z back), rigid.
-        field_of_view: horizontal, radians.
-        width, height: pixels.
-    """
-
-    camera_to_world: np.ndarray
-    field_of_view: float
-    width: int
+    camera_to_world: np.ndarray  # float64 [4, 4], OpenGL axes (x right, y up, z back), rigid
+    field_of_view: float  # horizontal, radians
+    width: int  # pixels
     height: int
 
     @property
@@ -58,34 +52,21 @@ def look_at(center: np.ndarray, target: np.ndarray, roll: float = 0.0) -> np.nda
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """The cameras of one scene.
+    """The cameras of one scene."""
 
-    Attributes:
-        kind: "hemisphere", "sphere", "turntable", "arc" or "forward".
-        center: [3], the point that the cameras look at.
-        distance: mean distance of the cameras from ``center``, world units.
-        azimuth: range, radians.
-        elevation_sine: range.
-        follow: fraction of a camera's offset from the rig's middle that its target also has: 0 for
-            one common target, 1 for parallel cameras.
-        unsteadiness: relative standard deviation of distances, and of targets.
-        roll: standard deviation, radians.
-        zoom: standard deviation of the logarithm of focal lengths.
-        field_of_view: of the image's width, radians.
-        width, height: pixels.
-    """
-
-    kind: str
-    center: np.ndarray
-    distance: float
-    azimuth: tuple[float, float]
-    elevation_sine: tuple[float, float]
+    kind: str  # "hemisphere", "sphere", "turntable", "arc" or "forward"
+    center: np.ndarray  # [3], the point that the cameras look at
+    distance: float  # mean distance of the cameras from ``center``, world units
+    azimuth: tuple[float, float]  # range, radians
+    elevation_sine: tuple[float, float]  # range
+    #: Fraction of a camera's offset from the rig's middle that its target also has: 0 for one
+    #: common target, 1 for parallel cameras.
     follow: float
-    unsteadiness: float
-    roll: float
-    zoom: float
-    field_of_view: float
-    width: int
+    unsteadiness: float  # relative standard deviation of distances, and of targets
+    roll: float  # standard deviation, radians
+    zoom: float  # standard deviation of the logarithm of focal lengths
+    field_of_view: float  # of the image's width, radians
+    width: int  # pixels
     height: int
 
     def _offset(self, position: np.ndarray, distance: float) -> np.ndarray:

@@ -45,7 +45,7 @@ from igsr_lab.synth.surroundings import draw_description
 
 #: Increased when a seed gives other scenes.
 RECIPE_VERSION = 2
-#: Fraction of the rig at its edges without test cameras, so that they are between the others.
+#: Fraction of the rig at its edges without test cameras, so that they lie between training cameras.
 TEST_MARGIN = 0.12
 
 Row = dict[str, Any]

@@ -11,18 +11,13 @@ from igsr_lab.synth.meshes import Mesh
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """A surface; two-sided unless it is glass.
+    """A surface; two-sided unless it is glass."""
 
-    Attributes:
-        kind: "matte" (Lambertian), "glossy" (a rough dielectric coat over a matte base), "metal"
-            (a rough conductor of this color) or "glass" (smooth, clear).
-        color: sRGB in [0, 1], [3] or a repeated texture [H, W, 3]; not used for glass.
-        roughness: GGX alpha of glossy and metal.
-    """
-
+    #: "matte" (Lambertian), "glossy" (a rough dielectric coat over a matte base), "metal" (a rough
+    #: conductor of this color) or "glass" (smooth, clear)
     kind: str
-    color: np.ndarray
-    roughness: float = 0.2
+    color: np.ndarray  # sRGB in [0, 1], [3] or a repeated texture [H, W, 3]; not used for glass
+    roughness: float = 0.2  # GGX alpha of glossy and metal
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,30 +41,19 @@ class Light:
 
 @dataclass(eq=False)
 class Description:
-    """A whole scene; lengths in world units, z up.
+    """A whole scene; lengths in world units, z up."""
 
-    Attributes:
-        family: "object" (photos have a transparent background) or "surroundings".
-        kind: of the surroundings; "none" for the family "object".
-        contents: names of the objects.
-        objects: the parts that masks show.
-        surroundings: all other parts.
-        lights: all lights except the sky.
-        sky: linear RGB radiance, equirectangular [H, W, 3], row 0 at the zenith, or None.
-        center: about the point that cameras look at.
-        radius: maximum distance of the objects from ``center``.
-        open_towards: azimuth in radians from which objects are seen best, or None for all.
-        room: maximum distance of cameras from ``center``; infinite outdoors.
-    """
-
-    family: str
-    kind: str
-    contents: list[str]
-    objects: list[Part]
+    family: str  # "object" (photos have a transparent background) or "surroundings"
+    kind: str  # of the surroundings; "none" for the family "object"
+    contents: list[str]  # names of the objects
+    objects: list[Part]  # the parts that masks show
+    #: Linear RGB radiance, equirectangular [H, W, 3], row 0 at the zenith, or None.
     sky: np.ndarray | None
-    surroundings: list[Part] = field(default_factory=list)
-    lights: list[Light] = field(default_factory=list)
+    surroundings: list[Part] = field(default_factory=list)  # all other parts
+    lights: list[Light] = field(default_factory=list)  # all lights except the sky
+    #: About the point that cameras look at.
     center: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    radius: float = 1.0
+    radius: float = 1.0  # maximum distance of the objects from ``center``
+    #: Azimuth in radians from which objects are seen best, or None for all.
     open_towards: float | None = None
-    room: float = np.inf
+    room: float = np.inf  # maximum distance of cameras from ``center``; infinite outdoors

@@ -142,17 +142,11 @@ def _lamp(light: Light) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class LoadedScene:
-    """A scene in Mitsuba.
+    """A scene in Mitsuba."""
 
-    Attributes:
-        scene: the whole scene.
-        objects: its objects only.
-        transparent: whether the background of photos is transparent.
-    """
-
-    scene: Any
-    objects: Any
-    transparent: bool
+    scene: Any  # the whole scene
+    objects: Any  # its objects only
+    transparent: bool  # whether the background of photos is transparent
 
 
 def load_scene(description: Description) -> LoadedScene:
