@@ -1,4 +1,4 @@
-"""A stand-in for Ray: what igsr uses of it, in this process (the real: test_blocks_ray.py)."""
+"""A fake of the parts of Ray that igsr uses; test_blocks_ray.py uses the real one."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import types
 
 
 class StandInRay(types.ModuleType):
-    """Calls run when they are waited for, the last one first."""
+    """Runs calls in this process when they are waited for, the last one first."""
 
     __version__ = "2.50.0"
 
@@ -71,7 +71,7 @@ class StandInRay(types.ModuleType):
 
 
 def stand_in_ray(monkeypatch) -> StandInRay:
-    """Takes the place of the module ray."""
+    """Replace the module ray."""
     ray = StandInRay()
     strategies = types.ModuleType("ray.util.scheduling_strategies")
     strategies.NodeAffinitySchedulingStrategy = lambda node, soft: node

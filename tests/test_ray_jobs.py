@@ -1,4 +1,4 @@
-"""Work over Ray: what is said where Ray, a cluster or a machine cannot be used."""
+"""Work on a Ray cluster: errors of Ray, of the cluster and of its machines; lost work."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def ray(monkeypatch):
     return stand_in_ray(monkeypatch)
 
 
-def test_ray_that_is_missing_or_of_another_version_is_named(ray, monkeypatch):
+def test_a_missing_or_unsupported_ray_is_named(ray, monkeypatch):
     for version in ("2.39.0", "3.0.1", "none"):
         monkeypatch.setattr(ray, "__version__", version)
         with pytest.raises(igsr.IgsrError, match=rf"Ray {version} is installed, and igsr needs"):
@@ -42,28 +42,25 @@ def test_a_cluster_that_cannot_be_joined_is_named(ray, error, reason):
     assert ray.addresses == ["auto"]
 
 
-def test_a_head_that_nobody_answers_for_is_named_at_once(ray):
+def test_an_address_without_a_listener_is_refused_at_once(ray):
     with pytest.raises(igsr.IgsrError, match=r"Ray cluster at 127\.0\.0\.1:9: .*refused"):
         RayCluster("127.0.0.1:9").__enter__()
     assert ray.addresses == []
 
 
 @pytest.mark.parametrize(
-    ("told", "message"),
+    ("answer", "message"),
     [
         (("far", "0.0.1", "AVX2", True), "far of the Ray cluster has igsr 0.0.1 where this one"),
-        (
-            ("far", igsr.__version__, "AVX2", False, "1"),
-            "far of the Ray cluster does not see",
-        ),
+        (("far", igsr.__version__, "AVX2", False, "1"), "far of the Ray cluster does not see"),
         (None, "head of the Ray cluster cannot run igsr .No module named 'igsr'.; install igsr"),
     ],
 )
-def test_a_machine_that_cannot_do_the_work_is_named(ray, monkeypatch, tmp_path, told, message):
+def test_an_unsuitable_machine_is_named(ray, monkeypatch, tmp_path, answer, message):
     def what_it_is(folder):
-        if told is None:
+        if answer is None:
             raise ModuleNotFoundError("No module named 'igsr'")
-        return told
+        return answer
 
     monkeypatch.setattr(ray_jobs, "_what_it_is", what_it_is)
     with RayCluster() as cluster, pytest.raises(igsr.IgsrError, match=message):
@@ -78,7 +75,7 @@ def test_a_machine_that_went_away_is_not_counted(ray, tmp_path):
         assert cluster.nodes == cluster.check(tmp_path)
 
 
-def test_lost_work_is_given_again_or_told(ray):
+def test_lost_work_is_repeated_or_returned_as_an_error(ray):
     begun = []
 
     def work(data, piece):
@@ -96,11 +93,10 @@ def test_lost_work_is_given_again_or_told(ray):
     pieces = ["fine", "large", "larger", "broken"]
     with RayCluster() as cluster:
         memory = [None, 5, 10**12, 0]
-        found = dict(cluster.results(work, "do", pieces, again=again, memory=memory))
-    assert found[0] == "do fine"
-    assert found[1] == "do small"
-    assert isinstance(found[2], WorkerLostError)
-    assert isinstance(found[3], RuntimeError)
+        results = dict(cluster.results(work, "do", pieces, again=again, memory=memory))
+    assert (results[0], results[1]) == ("do fine", "do small")
+    assert isinstance(results[2], WorkerLostError)
+    assert isinstance(results[3], RuntimeError)
     assert sorted(begun) == ["broken", "fine", "large", "larger", "small"]
 
 

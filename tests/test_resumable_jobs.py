@@ -1,4 +1,4 @@
-"""Runs of a study: kept one by one, whatever becomes of the others."""
+"""Runs that are kept one by one, and repeated if anything that they depend on changed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from igsr._internal.resumable_jobs import Run, finished_runs, folder_hash
 
 
 def work(data, what):
-    """Write a file and return a row; "fails" fails while "slow" is under way."""
+    """Write a file and return a row; "fails" fails while "slow" is running."""
     if what == "fails":
         time.sleep(0.5)
         raise igsr.IgsrError("this one fails.")
@@ -22,7 +22,7 @@ def work(data, what):
     return {"what": what}
 
 
-def test_when_a_run_fails_those_under_way_are_kept(tmp_path):
+def test_other_runs_are_kept_when_one_fails(tmp_path):
     runs = [Run(name, name, {}) for name in ("fails", "slow", "never")]
     with pytest.raises(igsr.IgsrError, match="this one fails"):
         finished_runs(tmp_path / "runs", runs, work, str(tmp_path), 2, None)
@@ -30,44 +30,29 @@ def test_when_a_run_fails_those_under_way_are_kept(tmp_path):
     assert not (tmp_path / "runs/fails.json").exists()
 
 
-def test_a_run_without_what_it_left_is_done_again(tmp_path):
-    left = tmp_path / "quick"
-    (run,) = runs = [Run("quick", "quick", {"steps": 3}, left)]
-    done = []
-
-    def rows():
-        return finished_runs(
-            tmp_path / "runs", runs, work, str(tmp_path), 1, lambda *row: done.append(row)
-        )
-
-    first = rows()
-    assert rows() == first
-    assert len(done) == 1
-    left.unlink()
-    assert rows() == first
-    assert len(done) == 2
-    assert left.is_file()
-    assert run.settings == {"steps": 3}
-
-
-def test_a_run_whose_scene_has_changed_is_done_again(tmp_path):
-    (tmp_path / "scene").mkdir()
+def test_a_run_is_repeated_if_its_file_scene_or_settings_changed(tmp_path):
     photo = tmp_path / "scene" / "photo.png"
+    photo.parent.mkdir()
     photo.write_bytes(b"first")
     done = []
 
-    def rows(scene):
-        runs = [Run("quick", "quick", {"steps": 3}, scene=scene)]
+    def rows(scene="scene", steps=3):
+        runs = [Run("quick", "quick", {"steps": steps}, tmp_path / "quick", scene=scene)]
         return finished_runs(
             tmp_path / "runs", runs, work, str(tmp_path), 1, lambda *row: done.append(row)
         )
 
-    (row,) = rows("scene")
+    (row,) = rows()
     assert row["settings"] == {"steps": 3, "data": folder_hash(photo.parent)}
-    assert rows("scene") == [row]
+    assert rows() == [row]
     assert len(done) == 1
-    photo.write_bytes(b"mended")
-    assert rows("scene") != [row]
+    (tmp_path / "quick").unlink()
+    assert rows() == [row]
     assert len(done) == 2
-    assert rows(None)[0]["settings"] == {"steps": 3}
+    assert (tmp_path / "quick").is_file()
+    photo.write_bytes(b"second")
+    assert rows() != [row]
     assert len(done) == 3
+    assert rows(scene=None)[0]["settings"] == {"steps": 3}
+    assert rows(scene=None, steps=4)[0]["settings"] == {"steps": 4}
+    assert len(done) == 5

@@ -10,6 +10,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -30,24 +31,13 @@ from igsr_lab.bench import (
     stage_rows,
     two_builds,
 )
-from igsr_lab.bench.comparison import MIN_FLIP, gradient_error, picture_error
+from igsr_lab.bench.comparison import MIN_FLIP, gradient_error, picture_error, size_row
 from igsr_lab.bench.plots import plot_speed_vs_error
 from igsr_lab.bench.table import describe_machine, not_run_lines
 
 #: A picture and a scene on which every row takes a fraction of a second.
 SMALL = {"count": 300, "side": 40}
 EXAMPLES = Path(__file__).parents[2] / "examples"
-
-
-@pytest.fixture
-def bench_here(lab_here):
-    """``python -m igsr_lab bench`` within this process: status, standard output, standard error."""
-
-    def bench(*arguments):
-        done = lab_here("bench", *arguments)
-        return done.returncode, done.stdout, done.stderr
-
-    return bench
 
 
 def small_scene(seed=3, **changes):
@@ -111,20 +101,12 @@ def test_the_garden_is_read_from_the_fixture(tmp_path):
     assert [row["pass"] for row in rows] == ["forward", "backward"]
 
 
-@pytest.mark.parametrize("content", [b"", b"not an archive", None])
-def test_other_files_than_the_garden_are_refused(tmp_path, content):
-    path = tmp_path / "other.npz"
-    if content is None:
-        np.savez(path, means3d=np.zeros((4, 2)), colors=np.zeros((4, 3)))
-    else:
-        path.write_bytes(content)
-    with pytest.raises(IgsrError, match=r"other\.npz"):
-        scenes.garden(path, 0)
-
-
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
+        (b"", "other.npz"),
+        (b"not an archive", "other.npz"),
+        ({"means3d": np.zeros((4, 2))}, "other.npz"),
         ({"width": 0}, "width"),
         ({"width": 99999999999}, "cannot be 99999999999"),
         ({"height": 16385}, "16384"),
@@ -140,7 +122,11 @@ def test_other_files_than_the_garden_are_refused(tmp_path, content):
     ],
 )
 def test_a_garden_that_cannot_be_rendered_is_refused(tmp_path, changes, words):
-    path = garden_file(tmp_path / "other.npz", **changes)
+    path = tmp_path / "other.npz"
+    if isinstance(changes, bytes):
+        path.write_bytes(changes)
+    else:
+        garden_file(path, **changes)
     with pytest.raises(IgsrError, match=words) as refused:
         scenes.garden(path, 0)
     assert "other.npz" in str(refused.value)
@@ -156,22 +142,15 @@ def test_culling_changes_nothing():
     assert comparison.band.of == scene.width * scene.height
 
 
-def test_the_band_of_crops_is_the_band_of_the_picture():
+def test_crops_equal_their_parts_of_the_picture_and_of_the_band():
     scene = small_scene()
     exact = _core.project(*scene.arrays(np.float64), **scene.options(), backend="reference")
+    shape = (scene.height, scene.width)
+    crops = oracle.crops(exact, scene.width, scene.height)
     size = {"width": scene.width, "height": scene.height}
-    whole = _core.band_pixels(exact, **size, alpha_band=2e-2) != 0
-    shape = (scene.height, scene.width)
-    assert 0 < whole.sum() < whole.size
-    crops = oracle.crops(exact, *shape[::-1])
-    assert (oracle.band(exact, crops, shape, 2e-2) == whole).all()
-
-
-def test_a_crop_equals_its_part_of_the_picture():
-    scene = small_scene()
-    exact = _core.project(*scene.arrays(np.float64), **scene.options(), backend="reference")
-    shape = (scene.height, scene.width)
-    crops = oracle.crops(exact, *shape[::-1])
+    band = _core.band_pixels(exact, **size, alpha_band=2e-2) != 0
+    assert 0 < band.sum() < band.size
+    assert (oracle.band(exact, crops, shape, 2e-2) == band).all()
     whole = oracle.picture(exact, crops, shape, scene.background)
     part = oracle.picture(exact, crops[2:4], shape, scene.background)
     known = np.isfinite(part["alpha"])
@@ -234,14 +213,13 @@ def test_only_pixels_of_the_band_are_left_out():
     assert (band.pixels, band.of) == (3, 4)
 
 
-def test_the_loss_equals_that_of_the_fit():
+def test_the_loss_equals_the_fits():
     shot = growth.shot_of(2, 60, 48)
     scene = shot.scene
     running = fit_rows.fitter(shot, "cpu")
     loss = running.step(1)["loss"]
-    dtype = np.float32
     picture = _core.rasterize(
-        _core.project(*scene.arrays(dtype), **scene.options(), backend="cpu"),
+        _core.project(*scene.arrays(np.float32), **scene.options(), backend="cpu"),
         width=scene.width,
         height=scene.height,
         background=scene.background,
@@ -265,12 +243,8 @@ def test_a_photo_with_alpha_is_composited_over_the_background():
 def test_rows_of_stages(backend):
     rows = stage_rows.rasterize_rows(backend, 0, 0.0, **SMALL)
     rows += stage_rows.pipeline_rows("W2", small_scene(), backend, 0, 0.0)
-    assert [row["pass"] for row in rows] == [
-        "rasterize",
-        "rasterize_backward",
-        "forward",
-        "backward",
-    ]
+    passes = ["rasterize", "rasterize_backward", "forward", "backward"]
+    assert [row["pass"] for row in rows] == passes
     for row in rows:
         checked_row(row)
     if backend == "cpu":
@@ -349,21 +323,17 @@ def test_rows_of_other_workloads_survive_a_failure(monkeypatch, tmp_path, error)
     assert all(row.keys() >= run.COLUMNS.keys() for row in rows)
 
 
-def test_models_for_w3_are_fitted_once(tmp_path):
+def test_models_for_w3_are_fitted_once_by_seed_and_steps(tmp_path, monkeypatch):
     capture = made_up.capture(views=4, size=32)
-    fitted = fit_rows.fitted_model
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fit_rows, "FIT_STEPS", 5)
-        first = fitted(capture, 200, tmp_path, 0)
-        patch.setattr(fit_rows, "fit_capture", None)
-        again = fitted(capture, 200, tmp_path, 0)
+    monkeypatch.setattr(fit_rows, "FIT_STEPS", 5)
+    first = fit_rows.fitted_model(capture, 200, tmp_path, 0)
+    monkeypatch.setattr(fit_rows, "fit_capture", None)
+    again = fit_rows.fitted_model(capture, 200, tmp_path, 0)
     assert first.means.tobytes() == again.means.tobytes()
-    # Other seeds and fits have other models.
     paths = {fit_rows.model_path(capture, 200, tmp_path, seed) for seed in (0, 1)}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fit_rows, "FIT_STEPS", 6)
-        paths.add(fit_rows.model_path(capture, 200, tmp_path, 0))
-    assert len(paths) == 3
+    monkeypatch.setattr(fit_rows, "FIT_STEPS", 6)
+    assert fit_rows.model_path(capture, 200, tmp_path, 0) not in paths
+    assert len(paths) == 2
 
 
 def test_the_models_folder_is_checked_before_the_work(monkeypatch, tmp_path):
@@ -404,7 +374,7 @@ def test_two_builds_take_turns(tmp_path):
         assert row["max_error_old"] == row["max_error_new"] < 1e-4
 
 
-def test_another_build_replaces_that_of_the_package(tmp_path):
+def test_another_build_replaces_the_packages(tmp_path):
     copy = str(shutil.copy(_core.__file__, tmp_path / "_core.abi3.so"))
     code = (
         "import sys; from igsr._internal.other_build import use_build; use_build(sys.argv[1]);"
@@ -417,35 +387,17 @@ def test_another_build_replaces_that_of_the_package(tmp_path):
     assert "in use already" in done.stderr
 
 
-def test_a_file_that_is_not_a_build_is_one_sentence(bench_here, tmp_path):
-    (tmp_path / "_core.abi3.so").write_bytes(b"not a module")
-    for file, words in (
-        (tmp_path / "_core.abi3.so", "could not be run"),
-        (tmp_path / "none.so", "no file"),
-    ):
-        status, out, err = bench_here("--backend", "cpu", "--workload", "W1", "--compare", file)
-        assert (status, out) == (1, "")
-        assert words in err
-        assert "--compare" in err
-
-
-class FakeBuild:
-    def __init__(self, answer):
-        self.answer = answer
-
-    def ask(self, name, seconds):
-        return self.answer
-
-
 @pytest.mark.parametrize(
     ("failing", "slower"),
     [("old", []), ("new", ["W4 with 5 splats on cpu: the new build failed: ValueError: no."])],
 )
 def test_a_failing_build_has_a_row_with_the_reason(failing, slower):
-    answers = {"old": {"fit step": [1.0, 2.0]}, "new": {"fit step": [1.0, 2.0]}}
+    answers = {build: {"fit step": [1.0, 2.0]} for build in ("old", "new")}
     answers[failing] = {"failed": "ValueError: no"}
     size = {"workload": "W4", "splats": 5, "backend": "cpu"}
-    old, new = FakeBuild(answers["old"]), FakeBuild(answers["new"])
+    old, new = (
+        SimpleNamespace(ask=lambda *question, build=build: answers[build]) for build in answers
+    )
     rows = two_builds.pair_rows(size, old, new, "W4 5 8", 0.0, 2)
     assert [row["not_run"] for row in rows] == [f"the {failing} build failed: ValueError: no"]
     assert two_builds.slower_rows(rows, 10.0) == slower
@@ -459,26 +411,11 @@ def test_slower_builds_are_named():
     ]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["--fail-above", "10"], "--compare FILE"),
-        (["--compare", "a.so", "--fail-above", "-1"], "--fail-above"),
-        (["--compare", "a.so", "--workload", "W2"], "leave W2 and W3 out"),
-        (["--compare", "a.so", "--plot", "p.png"], "leave --plot out"),
-    ],
-)
-def test_options_that_exclude_each_other(bench_here, arguments, words):
-    status, out, err = bench_here("--backend", "cpu", *arguments)
-    assert (status, out) == (1, "")
-    assert words in err
-
-
-def test_bench_writes_machine_and_rows(bench_here, tmp_path):
+def test_bench_writes_machine_and_rows(lab_here, tmp_path):
     arguments = ["--backend", "cpu", "--workload", "W1", "--workload", "W2", "--workload", "W3"]
     files = ["--json", tmp_path / "rows.json", "--plot", tmp_path / "plot.png"]
-    status, out, err = bench_here(*arguments, "--seconds", "0", *files)
-    assert status == 0, err
+    done = lab_here("bench", *arguments, "--seconds", "0", *files)
+    assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / "rows.json").read_text())
     assert report.keys() == {"machine", "rows"}
     assert report["machine"].keys() >= {"igsr", "seed", "protocol", "threads", "peak_gflops"}
@@ -495,45 +432,51 @@ def test_bench_writes_machine_and_rows(bench_here, tmp_path):
     assert len(lines) == 3
     assert "--garden" in lines[0]
     assert "--capture" in lines[1]
-    assert all(line in out for line in lines)
+    assert all(line in done.stdout for line in lines)
     with Image.open(tmp_path / "plot.png") as plot:
         assert plot.width > 500
+
+
+W3 = ["--workload", "W3"]
+PAGE = ["--accuracy", "page.md"]
+BUILD = ["--compare", "a.so"]
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--garden", "nowhere.npz"], "nowhere.npz"),
-        (["--capture", "nowhere"], "nowhere"),
-        (["--seconds", "-1"], "--seconds"),
-        (["--seconds", "nan"], "--seconds"),
-        (["--seed", "-1"], "--seed"),
-        (["--json", "/dev/null/rows.json"], "rows.json"),
+        ([*W3, "--garden", "nowhere.npz"], "nowhere.npz"),
+        ([*W3, "--capture", "nowhere"], "nowhere"),
+        ([*W3, "--seconds", "-1"], "--seconds"),
+        ([*W3, "--seconds", "nan"], "--seconds"),
+        ([*W3, "--seed", "-1"], "--seed"),
+        ([*W3, "--json", "/dev/null/rows.json"], "rows.json"),
+        ([*PAGE, *W3], "--accuracy runs no workloads; leave --workload out"),
+        ([*PAGE, "--garden", "a.npz"], "leave --garden out"),
+        ([*PAGE, "--capture", "a"], "leave --capture out"),
+        ([*PAGE, "--models", "a"], "leave --models out"),
+        (["--fail-above", "10"], "--compare FILE"),
+        ([*BUILD, "--fail-above", "-1"], "--fail-above"),
+        ([*BUILD, *W3], "leave W2 and W3 out"),
+        ([*BUILD, "--plot", "p.png"], "leave --plot out"),
+        ([*BUILD, "--workload", "W1"], "could not be run"),
+        (["--compare", "none.so"], "no file none.so; give --compare"),
     ],
 )
-def test_a_bad_argument_is_one_sentence(bench_here, arguments, words):
-    status, out, err = bench_here("--backend", "cpu", "--workload", "W3", *arguments)
-    assert status == 1
-    assert out == ""
-    assert words in err
-    assert err.endswith(".\n")
-    assert err.count("\n") == 1
+def test_a_bad_argument_is_one_sentence(lab_here, tmp_path, monkeypatch, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    Path("a.so").write_bytes(b"not a module")
+    done = lab_here("bench", "--backend", "cpu", *arguments)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert words in done.stderr
+    assert done.stderr.endswith(".\n")
+    assert done.stderr.count("\n") == 1
 
 
-@pytest.mark.parametrize(
-    "option",
-    [["--workload", "W1"], ["--garden", "a.npz"], ["--capture", "a"], ["--models", "a"]],
-)
-def test_accuracy_has_no_options_of_workloads(bench_here, tmp_path, option):
-    status, out, err = bench_here("--accuracy", tmp_path / "page.md", *option)
-    assert (status, out) == (1, "")
-    assert err == f"--accuracy runs no workloads; leave {option[0]} out.\n"
-
-
-def test_an_unknown_workload_is_refused(bench_here):
-    status, _, err = bench_here("--workload", "W9")
-    assert status == 2
-    assert "W9" in err
+def test_an_unknown_workload_is_refused(lab_here):
+    done = lab_here("bench", "--workload", "W9")
+    assert done.returncode == 2
+    assert "W9" in done.stderr
 
 
 @pytest.mark.parametrize(
@@ -541,15 +484,7 @@ def test_an_unknown_workload_is_refused(bench_here):
 )
 def test_growth_is_plotted(tmp_path, memory):
     rows = [
-        {
-            "workload": "W4",
-            "pass": "fit step",
-            "backend": "cpu",
-            "splats": count,
-            "width": side,
-            "ms": 1.0 * count * side,
-            **memory,
-        }
+        {**size_row("W4", "cpu", count, side, side), "ms": 1.0 * count * side, **memory}
         for count, side in growth.points()
     ]
     report = {"machine": describe_machine(["cpu"], 0), "rows": rows}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from functools import partial
 
 import numpy as np
 import pytest
@@ -22,8 +23,7 @@ def run(*arguments, app=app):
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
-def lab(*arguments):
-    return run(*arguments, app=lab_app)
+lab = partial(run, app=lab_app)
 
 
 @pytest.fixture(scope="module")
@@ -83,13 +83,9 @@ def test_mistakes_are_one_sentence(trained, monkeypatch, arguments, message):
     assert done.stderr.count("\n") == 1
 
 
-def test_help_loads_no_torch():
+def test_help_loads_no_torch_and_has_all_settings():
     code = "import sys, igsr_lab.commands.denoiser; print({'torch', 'matplotlib'} & {*sys.modules})"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
-
-
-def test_options_of_a_training_are_its_settings():
     help = lab("train", "--help").stdout
-    for name in settings_of(Training):
-        assert f"--{name.replace('_', '-')}" in help
+    assert all(f"--{name.replace('_', '-')}" in help for name in settings_of(Training))

@@ -7,9 +7,7 @@ import sys
 import time
 import types
 
-import numpy as np
 import pytest
-import torch
 
 import igsr
 from igsr import _core
@@ -32,8 +30,8 @@ def small(monkeypatch):
     monkeypatch.setattr(viewer_rows, "SMALL_SPLATS", 300)
 
 
-def report_of(monkeypatch, tmp_path, tests=None, workloads=("W2",)):
-    settings = benchmark.Settings(backends=("gpu",), workloads=workloads, seconds=0.0)
+def report_of(tmp_path, workload, tests=None):
+    settings = benchmark.Settings(backends=("gpu",), workloads=(workload,), seconds=0.0)
     report = benchmark.device_report(settings)
     path = tmp_path / "report.html"
     benchmark.write_device_report(path, {**report, "tests": tests})
@@ -41,8 +39,11 @@ def report_of(monkeypatch, tmp_path, tests=None, workloads=("W2",)):
 
 
 @pytest.mark.usefixtures("small")
-def test_the_page_has_the_device_times_and_errors(monkeypatch, tmp_path):
-    page, figures = report_of(monkeypatch, tmp_path)
+def test_the_page_has_the_device_times_errors_and_failed_tests(tmp_path):
+    tests = {"command": "cargo", "passed": 3, "failed": ["a_test"], "seconds": 1.0, "error": "<b>"}
+    page, figures = report_of(tmp_path, "W2", tests)
+    assert all(words in page for words in ("1 failed", "a_test", "&lt;b&gt;"))
+    assert figures["tests"] == tests
     device = figures["device"]
     assert device["name"] in page
     assert device["driver_info"] in page
@@ -76,14 +77,13 @@ def test_a_software_driver_has_a_small_w4(monkeypatch, tmp_path):
 
     monkeypatch.setattr(run, "growth_rows", rows)
     monkeypatch.setattr(run, "pair_rows", lambda backend, seed, seconds: [])
-    kind = _core.gpu_report()["kind"]
-    page, _ = report_of(monkeypatch, tmp_path, workloads=("W4",))
-    if kind == gpu_report.SOFTWARE:
+    page, _ = report_of(tmp_path, "W4")
+    if _core.gpu_report()["kind"] == gpu_report.SOFTWARE:
         assert ran == [(run.SMALL_POINTS, "W4 small")]
         assert "W4 small on gpu not run: only asked" in page
     monkeypatch.setattr(gpu_report, "SOFTWARE", "none")
     ran.clear()
-    report_of(monkeypatch, tmp_path, workloads=("W4",))
+    report_of(tmp_path, "W4")
     assert ran == [(None, "W4")]
 
 
@@ -96,22 +96,13 @@ def test_a_failing_viewer_is_one_message(monkeypatch):
         viewer_rows.viewer_rows((64, 48), 0, True)
 
 
-@pytest.mark.usefixtures("small")
-def test_failed_tests_are_on_the_page(monkeypatch, tmp_path):
-    tests = {"command": "cargo", "passed": 3, "failed": ["a_test"], "seconds": 1.0, "error": "<b>"}
-    page, figures = report_of(monkeypatch, tmp_path, tests)
-    assert "1 failed" in page
-    assert "a_test" in page
-    assert "&lt;b&gt;" in page
-    assert figures["tests"] == tests
-
-
 def test_the_page_has_the_reason_for_no_device(monkeypatch, tmp_path):
+    why = "backend gpu: no adapter answers"
+
     def fails():
-        raise RuntimeError("backend gpu: no adapter answers")
+        raise RuntimeError(why)
 
     monkeypatch.setattr(_core, "gpu_report", fails)
-    why = "backend gpu: no adapter answers"
     device = gpu_report.describe_device()
     assert device == {"name": None, "error": why}
     machine = benchmark.run_benchmark(benchmark.Settings(("cpu",), ()))["machine"]
@@ -165,32 +156,13 @@ def fake_gsplat(draws):
     return module
 
 
-def test_gsplat_gets_scales_and_opacities(monkeypatch):
-    scene = shot_of(0, 30, 16).scene
-    calls = []
-
-    def draws(means, quats, scales, opacities, colors, viewmats, Ks, width, height, **more):
-        calls.append((scales.detach(), opacities.detach(), Ks, more["backgrounds"].shape))
-        value = means.sum() + quats.sum() + scales.sum() + opacities.sum() + colors.sum()
-        return value.expand(1, height, width, 3), value.expand(1, height, width, 1), {}
-
-    monkeypatch.setitem(sys.modules, "gsplat", fake_gsplat(draws))
-    rows = gsplat_rows.gsplat_rows("ball", scene, upstream(0, 16, 16), 0.0, "cpu")
-    assert [row["pass"] for row in rows] == ["forward", "backward"]
-    assert all(row["ms"] >= 0.0 and row["backend"] == "gsplat" for row in rows)
-    scales, opacities, Ks, backgrounds = calls[0]
-    np.testing.assert_allclose(scales, np.exp(scene.splats["scales"]), rtol=1e-6)
-    assert torch.all((opacities > 0.0) & (opacities < 1.0))
-    assert Ks.shape == (1, 3, 3)
-    assert Ks[0, 0, 0] == scene.intrinsics[0]
-    assert backgrounds == (1, 3)
-    assert min(row["max_error"] for row in rows) > 1.0
-
-
-def test_gsplats_rows_have_errors(monkeypatch):
+def test_gsplat_gets_the_scene_and_its_rows_have_errors(monkeypatch):
     monkeypatch.setitem(sys.modules, "gsplat", fake_gsplat(igsr.rasterization))
     scene = shot_of(0, 30, 16).scene
     picture, gradients = gsplat_rows.gsplat_rows("ball", scene, upstream(0, 16, 16), 0.0, "cpu")
+    for row, kind in ((picture, "forward"), (gradients, "backward")):
+        assert (row["pass"], row["backend"]) == (kind, "gsplat")
+        assert row["ms"] > 0.0
     assert picture["error_of"] == "picture"
     assert 0.0 < picture["max_error"] < 1e-5
     assert gradients["error_of"] == "gradients"

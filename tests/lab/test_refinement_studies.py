@@ -94,7 +94,6 @@ def given(data, **options):
 def test_table2_has_a_row_per_method_and_is_kept(data):
     report = study.table2(study_in(data), **given(data))
     for layout in ("localized", "scattered"):
-        assert set(report[layout]) == {"ours", "improvement", "absolute"}
         firsts = [method["rounds"][0] for method in report[layout].values()]
         assert firsts[0] == firsts[1] == firsts[2], "all continue from one fit"
         for name in ("improvement", "absolute"):
@@ -104,7 +103,6 @@ def test_table2_has_a_row_per_method_and_is_kept(data):
             assert set(after) >= {"psnr", "ssim", "flip", "perceptual", "near", "far"}
     assert report["runs"][0]["methods"]["improvement"]["rounds"][1]["added"] == 2
     text = (data / "out/study.md").read_text()
-    assert "| ball | localized 10 | ours | 0 |" in text
     assert "| ball | localized 10 | improvement | 1 |" in text
     assert "11.259" in text, "the paper's figures are in the report"
     for name in ("study", "ball-localized10", "ball-scattered10"):
@@ -223,13 +221,11 @@ def test_gains_are_paired_by_held_out_view():
 
     gains = paired_gains([run(1.0, 3.0), run(2.0, 4.0)], "ours")
     assert set(gains) == {"psnr"}, "no view has the other scores"
-    assert gains["psnr"]["gain"] == pytest.approx(2.5)
-    assert gains["psnr"]["standard_error"] == pytest.approx(1.0), "of 1.5 and 3.5"
-    assert gains["psnr"]["seeds"] == pytest.approx(np.sqrt(0.5))
+    assert list(gains["psnr"].values()) == pytest.approx([2.5, 1.0, np.sqrt(0.5)])
     single = paired_gains([run(0.5)], "ours")
     assert single["psnr"] == {"gain": 0.5, "standard_error": None, "seeds": None}
-    assert mean_gains([gains, single])["psnr"]["gain"] == pytest.approx(1.5)
-    assert mean_gains([gains, single])["psnr"]["standard_error"] == pytest.approx(1.0)
+    mean = mean_gains([gains, single])["psnr"]
+    assert mean == {"gain": pytest.approx(1.5), "standard_error": pytest.approx(1.0)}
 
 
 @pytest.mark.parametrize(
@@ -249,9 +245,3 @@ def test_bad_arguments_are_refused_before_the_first_fit(data, run, changes, mess
     with pytest.raises(igsr.IgsrError, match=message):
         run(study_in(data), **given(data, **changes))
     assert not (data / "out").exists()
-
-
-def test_the_command_names_missing_features(data, lab_here):
-    command = ["study", "table2", data / "data", "--out", data / "bad", "--scene", "ball"]
-    refused = lab_here(*command, "--weights", data / "a.safetensors")
-    assert "selects by a perceptual distance; give --features" in refused.stderr

@@ -61,12 +61,17 @@ def scene(folder, index):
     return folder / f"scene_{index:05d}"
 
 
+def masks_and_depths(folder):
+    for view in load_capture(folder).train_views:
+        mask = np.asarray(Image.open(folder / "mask" / view.name))
+        yield view, mask, np.load(folder / "depth" / Path(view.name).with_suffix(".npy"))
+
+
 def test_captures_load_with_the_written_cameras(made):
-    families = set()
-    for index in (LONE, AROUND):
+    for index, family, channels in ((LONE, "object", 4), (AROUND, "surroundings", 3)):
         folder = scene(made, index)
         about = json.loads((folder / "scene.json").read_text())
-        families.add(about["family"])
+        assert about["family"] == family
         assert (about["recipe"]["seed"], about["recipe"]["index"]) == (0, index)
         assert about["mitsuba"]
         assert about["pyoidn"]
@@ -81,21 +86,16 @@ def test_captures_load_with_the_written_cameras(made):
             camera_to_world = np.linalg.inv(view.camera.viewmat)
             center = np.array(frame["transform_matrix"])[:3, 3]
             assert np.allclose(camera_to_world[:3, 3], center, atol=1e-12)
-            channels = 4 if about["family"] == "object" else 3
             assert view.image.shape == (view.camera.height, view.camera.width, channels)
             # Not black, overexposed or flat.
             assert 10 < view.image[..., :3].mean() < 245
             assert view.image[..., :3].std() > 5
-    assert families == {"object", "surroundings"}
 
 
 def test_masks_and_depths_agree_with_alpha(made):
-    folder = scene(made, LONE)
-    for view in load_capture(folder).train_views:
+    for view, mask, depth in masks_and_depths(scene(made, LONE)):
         alpha = view.image[..., 3]
-        mask = np.asarray(Image.open(folder / "mask" / view.name))
         assert (mask == alpha).all()
-        depth = np.load(folder / "depth" / Path(view.name).with_suffix(".npy"))
         assert depth.dtype == np.float32
         # The center of a pixel may differ from its other samples at thin parts.
         assert np.isfinite(depth[alpha == 255]).mean() > 0.95
@@ -105,10 +105,7 @@ def test_masks_and_depths_agree_with_alpha(made):
 
 
 def test_masks_of_surroundings_show_only_the_objects(made):
-    folder = scene(made, AROUND)
-    for view in load_capture(folder).train_views:
-        mask = np.asarray(Image.open(folder / "mask" / view.name))
-        depth = np.load(folder / "depth" / Path(view.name).with_suffix(".npy"))
+    for _, mask, depth in masks_and_depths(scene(made, AROUND)):
         assert set(np.unique(mask)) == {0, 255}
         assert np.isfinite(depth[mask == 255]).all()
         assert np.isfinite(depth[mask == 0]).any()
@@ -149,31 +146,22 @@ def test_finished_scenes_are_kept_and_unfinished_ones_removed(made, tmp_path):
 
 def test_scenes_made_on_ray_are_the_same(made, tmp_path, monkeypatch):
     ray = stand_in_ray(monkeypatch)
-    options = {"first": OTHER, "settings": SMALL, "ray": True}
+    options = {"settings": SMALL, "ray": True}
     seen = []
-    report = synthesize(
-        tmp_path / "out", 2, on_scene=lambda *args: seen.append((*args[:2], args[2]["name"])),
-        **options,
-    )  # fmt: skip
+    report = synthesize(tmp_path, 2, first=OTHER, on_scene=lambda *row: seen.append(row), **options)
     # The stand-in does the last one first.
-    names = [f"scene_{index:05d}" for index in (OTHER, LONE)]
-    assert seen == [(1, 2, names[1]), (2, 2, names[0])]
-    assert [row["name"] for row in report["scenes"]] == names
-    assert files(scene(tmp_path / "out", LONE)) == files(scene(made, LONE))
+    assert seen == [(1, 2, report["scenes"][1]), (2, 2, report["scenes"][0])]
+    assert [row["name"] for row in report["scenes"]] == ["scene_00006", "scene_00007"]
+    assert files(scene(tmp_path, LONE)) == files(scene(made, LONE))
     assert not ray.running
 
-    real = captures._photograph
-
-    def broken(folder, seed, index, settings):
-        if index == LONE:
-            raise OSError(28, "No space left on device")
-        return real(folder, seed, index, settings)
+    def broken(*given):
+        raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(captures, "_photograph", broken)
     with pytest.raises(IgsrError, match=r"Cannot write .*No space left"):
-        synthesize(tmp_path / "full", 2, **options)
-    assert scene(tmp_path / "full", OTHER).is_dir()
-    assert not scene(tmp_path / "full", LONE).exists()
+        synthesize(tmp_path, 1, first=AROUND, **options)
+    assert not scene(tmp_path, AROUND).exists()
 
 
 def test_two_processes_can_make_one_scene(tmp_path, monkeypatch):
@@ -236,7 +224,7 @@ def test_few_light_paths_are_denoised():
     assert 10.0 * np.log10(255.0**2 / error) > 37.0
 
 
-def test_depth_is_exact_and_reprojects_between_views():
+def test_depths_and_masks_are_exact():
     description = ball_on_plane()
     rig = draw_rig(np.random.default_rng(3), description, 48)
     rng = np.random.default_rng(0)
@@ -245,7 +233,6 @@ def test_depth_is_exact_and_reprojects_between_views():
         loaded = load_scene(description)
         seen = [first_hits(loaded, view) for view in views]
         photo = encode(take_photo(loaded, views[0], 16, 0))
-    points = []
     for view, (depth, is_object) in zip(views, seen, strict=True):
         rows, columns = np.mgrid[: view.height, : view.width] + 0.5
         x = (columns - 0.5 * view.width) / view.focal
@@ -259,17 +246,6 @@ def test_depth_is_exact_and_reprojects_between_views():
         around = np.isfinite(depth) & ~is_object
         assert around.any()
         assert np.abs(world[around][:, 2]).max() < 1e-4
-        points.append(world)
-    # Points of the first view are not in front of the second view's depth.
-    first, (depth, _) = points[0][np.isfinite(seen[0][0])], seen[1]
-    away = (first - views[1].camera_to_world[:3, 3]) @ -views[1].camera_to_world[:3, 2]
-    pixels = np.array([views[1].project(point) for point in first])
-    size = np.array([views[1].width, views[1].height])
-    inside = ((pixels >= 1) & (pixels < size - 1)).all(axis=1)
-    column, row = pixels[inside].astype(int).T
-    difference = (away[inside] - depth[row, column])[np.isfinite(depth[row, column])]
-    assert np.median(np.abs(difference)) < 0.02
-    assert (np.abs(difference) < 0.1).mean() > 0.8
     red = photo[..., 0].astype(int) - photo[..., 1] > 40
     assert (red == seen[0][1]).mean() > 0.95
 
@@ -300,8 +276,7 @@ def test_textures_and_skies_are_colors():
         rng = np.random.default_rng(1)
         picture = texture(rng, palette(rng, 0.5), 64)
         assert picture.shape == (64, 64, 3), name
-        assert picture.min() >= 0.0, name
-        assert picture.max() <= 1.0, name
+        assert 0.0 <= picture.min() <= picture.max() <= 1.0, name
     for sky in {*SKIES, *UNSEEN_SKIES}:
         light = sky(np.random.default_rng(1))
         assert light.shape[1] == 2 * light.shape[0]
