@@ -19,6 +19,7 @@ import igsr
 #: has its whole path here: ``{"settings.steps": "steps"}``.
 REPORT_KEYS: dict[str, str] = {
     "after": "with",
+    "center": "centre",
     "cross_validation": "left_out",
     "gain": "worth",
     "mean_confidence": "mean_trust",
