@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from igsr._internal.worker_processes import worker_processes
+from igsr._internal.worker_processes import WorkerLostError, in_a_process, worker_processes
 
 #: Starts a worker, says its number, and waits for it.
 PARENT = """
@@ -26,6 +26,11 @@ def test_each_has_its_share_of_threads():
     with worker_processes(2, threads=3) as pool:
         assert pool.submit(os.getenv, "OMP_NUM_THREADS").result() == "3"
         assert pool.submit(os.getenv, "RAYON_NUM_THREADS").result() == "3"
+
+
+def test_a_process_that_ends_without_a_result_is_lost():
+    with pytest.raises(WorkerLostError, match="may have run out of memory"):
+        in_a_process(os._exit, 9)
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGKILL")

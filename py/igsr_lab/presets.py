@@ -1,7 +1,7 @@
 """Settings that studies compare: igsr's default and two baselines.
 
-"3dgs" is the recipe of Kerbl et al. 2023 with 7 000 steps; "instantsplat" that of Fan et al. 2024:
-many splats from dense points, whose number stays fixed, with cameras and one focal length
+"3dgs" is the recipe of Kerbl et al. 2023 with 7 000 steps; "instantsplat" the recipe of Fan et al.
+2024: many splats from dense points, whose number stays fixed, with cameras and one focal length
 optimized. Its points are the capture's, or are made from its photos.
 """
 
@@ -19,7 +19,7 @@ PRESETS: tuple[Preset, ...] = get_args(Preset)
 
 #: Steps of the paper's fits to photos whose cameras have noise.
 PAPER_STEPS = 5000
-#: 3DGS has no maximum number of splats: as many as 8 GB of memory hold.
+#: 3DGS has no maximum number of splats; this number fits in 8 GB of memory.
 _UNLIMITED_SPLATS = 4_000_000
 #: 3DGS starts from SfM points if there are at least this many, else from random ones.
 _MIN_POINTS = 100
@@ -79,7 +79,7 @@ def preset_settings(
     Args:
         name: one of ``PRESETS``.
         photos, quality: as ``igsr.fitting.presets.settings_for``.
-        **given: settings that replace those of the preset, unless None.
+        **given: settings that replace the preset's, unless None.
 
     Raises:
         IgsrError: the preset or a setting is unknown or invalid.

@@ -1,4 +1,4 @@
-"""How alike the errors of two sets of renders are."""
+"""Similarity of the errors of two sets of renders."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from igsr_lab.study.artifact_likeness import NAMES, OCTAVES, likeness, plot_like
 
 
 def renders(coarse, count=4, size=64, seed=0):
-    """Grey pictures and the same with blocks of ``coarse`` pixels, each wrong by its own amount."""
+    """Gray pictures, and the same with random errors in blocks of ``coarse`` pixels."""
     random = np.random.default_rng(seed)
     truth = np.full((count, 3, size, size), 128, np.uint8)
     wrong = random.integers(-40, 40, (count, 1, size // coarse, size // coarse))
@@ -20,23 +20,22 @@ def renders(coarse, count=4, size=64, seed=0):
     return Pairs(inputs, truth, np.ones((count, size, size), np.bool_))
 
 
-def test_a_wave_is_in_its_octave():
-    x = np.arange(64)
-    for frequency, octave in ((0.3, -1), (0.2, -2), (0.1, -3), (0.05, -4)):
-        wave = np.rint(50 * np.sin(2 * np.pi * frequency * x)).astype(np.int64)
-        one = renders(1, count=1)
-        one.inputs[0, :3] = 128 + wave[None, None, :]
-        (row,) = signatures([one])
-        shares = row[: len(OCTAVES)]
-        assert np.sum(shares) == pytest.approx(1.0)
-        assert shares[octave] > 0.9
+@pytest.mark.parametrize(("frequency", "octave"), [(0.3, -1), (0.2, -2), (0.1, -3), (0.05, -4)])
+def test_a_wave_is_in_its_octave(frequency, octave):
+    pairs = renders(1, count=1)
+    wave = np.rint(50 * np.sin(2 * np.pi * frequency * np.arange(64))).astype(np.int64)
+    pairs.inputs[0, :3] = 128 + wave[None, None, :]
+    (row,) = signatures([pairs])
+    shares = row[: len(OCTAVES)]
+    assert np.sum(shares) == pytest.approx(1.0)
+    assert shares[octave] > 0.9
 
 
 def test_power_in_few_pixels_shows():
-    one = renders(1, count=1)
-    one.inputs[0, :3] = 128
-    one.inputs[0, :3, 20:24, 30:34] = 255
-    assert signatures([one])[0, -1] == 1.0
+    pairs = renders(1, count=1)
+    pairs.inputs[0, :3] = 128
+    pairs.inputs[0, :3, 20:24, 30:34] = 255
+    assert signatures([pairs])[0, -1] == 1.0
     assert signatures([renders(1)])[:, -1].max() < 0.5
 
 

@@ -1,4 +1,4 @@
-"""The benchmark: workloads, oracle, rows, and that it sees a broken renderer."""
+"""The benchmark: workloads, oracle, errors, rows, two builds, the command."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,39 +21,23 @@ from PIL import Image
 from igsr import _core
 from igsr._internal import peak_memory
 from igsr.errors import IgsrError
-from igsr_lab import __main__ as lab
 from igsr_lab.bench import (
     accuracy,
-    build_pairs,
     fit_rows,
     growth,
-    machine,
     oracle,
     run,
     scenes,
     stage_rows,
+    two_builds,
 )
-from igsr_lab.bench.comparison import FLIP, gradient_error, picture_error
+from igsr_lab.bench.comparison import MIN_FLIP, gradient_error, picture_error, size_row
 from igsr_lab.bench.plots import plot_speed_vs_error
-from igsr_lab.bench.table import not_run_lines
+from igsr_lab.bench.table import describe_machine, not_run_lines
 
 #: A picture and a scene on which every row takes a fraction of a second.
 SMALL = {"count": 300, "side": 40}
 EXAMPLES = Path(__file__).parents[2] / "examples"
-
-
-@pytest.fixture
-def igsr_bench(capsys):
-    """``python -m igsr_lab bench`` within this process: status, standard output, standard error."""
-
-    def bench(*arguments):
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as ended:
-            lab.app(["bench", *map(str, arguments)])
-        output = capsys.readouterr()
-        return ended.value.code, output.out, output.err
-
-    return bench
 
 
 def small_scene(seed=3, **changes):
@@ -60,7 +45,7 @@ def small_scene(seed=3, **changes):
 
 
 def checked_row(row):
-    """Assert what every row that ran promises."""
+    """Check the columns of a row that ran."""
     assert row["ms"] > 0
     assert row["ms_median"] >= row["ms"]
     assert row["repeats"] >= stage_rows.MIN_REPEATS
@@ -71,10 +56,7 @@ def checked_row(row):
     assert row["left_out_pixels"] <= max(1, row["compared_pixels"] // 1000)
 
 
-# ---- the workloads ------------------------------------------------------------------------------
-
-
-def test_w1_is_the_workload_that_was_asked_for():
+def test_w1_has_the_amount_of_work_of_its_definition():
     splats = scenes.splats2d(0)
     counts = oracle.pair_counts(splats, 400, 400)
     assert counts.tiles == pytest.approx(98_500, rel=0.02)
@@ -96,7 +78,7 @@ def test_the_same_seed_gives_the_same_bits():
 
 
 def garden_file(path, **changes):
-    """A file like the fixture, with one point."""
+    """A fixture with one point."""
     arrays = {
         "means3d": np.array([[0.0, 0.0, 2.0]], np.float32),
         "colors": np.array([[255, 0, 51]], np.uint8),
@@ -109,7 +91,7 @@ def garden_file(path, **changes):
     return path
 
 
-def test_the_garden_takes_what_the_fixture_holds(tmp_path):
+def test_the_garden_is_read_from_the_fixture(tmp_path):
     garden = scenes.garden(garden_file(tmp_path / "garden.npz"), 0)
     assert (garden.width, garden.height) == (32, 24)
     assert garden.intrinsics.tolist() == [30.0, 31.0, 16.0, 12.0]
@@ -119,20 +101,12 @@ def test_the_garden_takes_what_the_fixture_holds(tmp_path):
     assert [row["pass"] for row in rows] == ["forward", "backward"]
 
 
-@pytest.mark.parametrize("content", [b"", b"not an archive", None])
-def test_what_is_not_the_garden_is_refused(tmp_path, content):
-    path = tmp_path / "other.npz"
-    if content is None:
-        np.savez(path, means3d=np.zeros((4, 2)), colors=np.zeros((4, 3)))
-    else:
-        path.write_bytes(content)
-    with pytest.raises(IgsrError, match=r"other\.npz"):
-        scenes.garden(path, 0)
-
-
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
+        (b"", "other.npz"),
+        (b"not an archive", "other.npz"),
+        ({"means3d": np.zeros((4, 2))}, "other.npz"),
         ({"width": 0}, "width"),
         ({"width": 99999999999}, "cannot be 99999999999"),
         ({"height": 16385}, "16384"),
@@ -147,15 +121,16 @@ def test_what_is_not_the_garden_is_refused(tmp_path, content):
         ({"means3d": np.array([[0.0, 0.0, -2.0]])}, "sees none"),
     ],
 )
-def test_a_garden_that_cannot_be_drawn_is_refused(tmp_path, changes, words):
-    path = garden_file(tmp_path / "other.npz", **changes)
+def test_a_garden_that_cannot_be_rendered_is_refused(tmp_path, changes, words):
+    path = tmp_path / "other.npz"
+    if isinstance(changes, bytes):
+        path.write_bytes(changes)
+    else:
+        garden_file(path, **changes)
     with pytest.raises(IgsrError, match=words) as refused:
         scenes.garden(path, 0)
     assert "other.npz" in str(refused.value)
     assert "--garden" in str(refused.value)
-
-
-# ---- the oracle ---------------------------------------------------------------------------------
 
 
 def test_culling_changes_nothing():
@@ -167,30 +142,20 @@ def test_culling_changes_nothing():
     assert comparison.band.of == scene.width * scene.height
 
 
-def test_the_band_of_crops_is_the_band_of_the_picture():
+def test_crops_equal_their_parts_of_the_picture_and_of_the_band():
     scene = small_scene()
     exact = _core.project(*scene.arrays(np.float64), **scene.options(), backend="reference")
+    shape = (scene.height, scene.width)
+    crops = oracle.crops(exact, scene.width, scene.height)
     size = {"width": scene.width, "height": scene.height}
-    whole = _core.band_pixels(exact, **size, alpha_band=2e-2) != 0
-    shape = (scene.height, scene.width)
-    assert 0 < whole.sum() < whole.size
-    crops = oracle.crops(exact, *shape[::-1])
-    assert (oracle.band(exact, crops, shape, 2e-2) == whole).all()
-
-
-def test_some_crops_say_what_the_whole_says():
-    scene = small_scene()
-    exact = _core.project(*scene.arrays(np.float64), **scene.options(), backend="reference")
-    shape = (scene.height, scene.width)
-    crops = oracle.crops(exact, *shape[::-1])
+    band = _core.band_pixels(exact, **size, alpha_band=2e-2) != 0
+    assert 0 < band.sum() < band.size
+    assert (oracle.band(exact, crops, shape, 2e-2) == band).all()
     whole = oracle.picture(exact, crops, shape, scene.background)
     part = oracle.picture(exact, crops[2:4], shape, scene.background)
     known = np.isfinite(part["alpha"])
     assert known.sum() == sum(crop.width * crop.height for crop in crops[2:4])
     assert (part["color"][known] == whole["color"][known]).all()
-
-
-# ---- errors -------------------------------------------------------------------------------------
 
 
 def test_a_broken_renderer_shows(monkeypatch):
@@ -225,7 +190,7 @@ def test_broken_gradients_show(monkeypatch):
     assert backward["max_error"] == pytest.approx(0.01, rel=0.01)
 
 
-def test_nan_is_no_small_error():
+def test_nan_is_an_infinite_error():
     picture = {"color": np.zeros((2, 2, 3)), "alpha": np.zeros((2, 2))}
     picture["transmittance"] = np.ones((2, 2))
     wrong = picture | {"color": np.full((2, 2, 3), np.nan)}
@@ -237,10 +202,10 @@ def test_nan_is_no_small_error():
 def test_only_pixels_of_the_band_are_left_out():
     expected = {"color": np.zeros((1, 4, 3)), "alpha": np.zeros((1, 4))}
     expected["transmittance"] = np.full((1, 4), 1e-2)
-    # The third blended another pair behind something opaque: only its transmittance tells.
+    # The third blends another pair behind something opaque: only its transmittance differs.
     got = expected | {
         "alpha": np.array([[1e-3, 1e-9, 1e-9, 1e-5]]),
-        "transmittance": np.array([[1e-2, 1e-2, 1e-2 * (1.0 - 2.0 * FLIP), 0.9e-2]]),
+        "transmittance": np.array([[1e-2, 1e-2, 1e-2 * (1.0 - 2.0 * MIN_FLIP), 0.9e-2]]),
     }
     error, band = picture_error(got, expected, np.array([[True, True, True, False]]), 1e-6)
     assert error.max == 1e-5
@@ -248,14 +213,13 @@ def test_only_pixels_of_the_band_are_left_out():
     assert (band.pixels, band.of) == (3, 4)
 
 
-def test_the_loss_of_a_step_is_the_fits_own():
+def test_the_loss_equals_the_fits():
     shot = growth.shot_of(2, 60, 48)
     scene = shot.scene
     running = fit_rows.fitter(shot, "cpu")
     loss = running.step(1)["loss"]
-    dtype = np.float32
     picture = _core.rasterize(
-        _core.project(*scene.arrays(dtype), **scene.options(), backend="cpu"),
+        _core.project(*scene.arrays(np.float32), **scene.options(), backend="cpu"),
         width=scene.width,
         height=scene.height,
         background=scene.background,
@@ -268,31 +232,23 @@ def test_the_loss_of_a_step_is_the_fits_own():
     assert loss == pytest.approx(expected.item(), rel=1e-5)
 
 
-def test_a_photo_with_alpha_lies_over_the_background():
+def test_a_photo_with_alpha_is_composited_over_the_background():
     scene = small_scene(background=np.array([1.0, 0.5, 0.0], np.float32))
     photo = np.zeros((40, 48, 4), np.uint8)
     photo[..., 3] = 51
     np.testing.assert_allclose(fit_rows.Shot(scene, photo).target()[0, 0], [0.8, 0.4, 0.0])
 
 
-# ---- rows ---------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("backend", ["cpu", "gpu"])
 def test_rows_of_stages(backend):
     rows = stage_rows.rasterize_rows(backend, 0, 0.0, **SMALL)
     rows += stage_rows.pipeline_rows("W2", small_scene(), backend, 0, 0.0)
-    assert [row["pass"] for row in rows] == [
-        "rasterize",
-        "rasterize_backward",
-        "forward",
-        "backward",
-    ]
+    passes = ["rasterize", "rasterize_backward", "forward", "backward"]
+    assert [row["pass"] for row in rows] == passes
     for row in rows:
         checked_row(row)
     if backend == "cpu":
         assert 0 < rows[0]["fraction_of_peak"] < 1
-    # The whole pass takes at least as long as its fastest stages together.
     assert rows[2]["ms"] >= 0.999 * sum(rows[2]["stages_ms"].values())
 
 
@@ -306,38 +262,41 @@ def test_rows_of_steps():
 
 @pytest.mark.skipif(
     not os.access(peak_memory.CLEAR_REFS, os.W_OK),
-    reason="only Linux forgets a process's peak memory",
+    reason="only Linux can reset a process's peak memory",
 )
 def test_a_fit_keeps_its_memory_contract():
     (row,) = growth.growth_rows("cpu", 0, [(100_000, 512)], 0.0)
     checked_row(row)
-    # Parameters and moments must be somewhere.
+    # At least parameters and moments.
     assert 3 * growth.parameter_bytes(100_000) < 100_000 * row["bytes_per_splat"]
     assert row["bytes_per_splat"] <= 1.0 * row["contract_bytes_per_splat"]
 
 
-@pytest.mark.parametrize("change", ["a device of its own", "a peak that stays"])
-def test_memory_that_cannot_be_told_is_left_out(monkeypatch, tmp_path, change):
-    if change == "a device of its own":
+@pytest.mark.parametrize("is_on_device", [True, False])
+def test_unknown_memory_is_left_out(monkeypatch, tmp_path, is_on_device):
+    if is_on_device:
         monkeypatch.setattr(growth, "runs_on_cores", lambda backend: False)
     else:
         monkeypatch.setattr(peak_memory, "CLEAR_REFS", tmp_path / "nowhere" / "clear_refs")
-    point = growth.measure(0, 200, 32, "cpu", 0.0)
-    monkeypatch.setattr(growth, "measure_apart", lambda *arguments: point)
+    monkeypatch.setattr(growth, "in_a_process", lambda work, *arguments: work(*arguments))
     (row,) = growth.growth_rows("cpu", 0, [(200, 32)], 0.0)
     checked_row(row)
     assert not [name for name in row if "bytes" in name]
 
 
-def test_a_child_that_fails_is_a_row_that_says_so(monkeypatch):
-    monkeypatch.setattr(sys, "executable", shutil.which("false"))
+@pytest.mark.parametrize("error", [IgsrError("It ended early."), RuntimeError("The GPU is lost.")])
+def test_a_failed_point_has_a_row_with_the_reason(monkeypatch, error):
+    def failing(*arguments):
+        raise error
+
+    monkeypatch.setattr(growth, "in_a_process", failing)
     (row,) = growth.growth_rows("cpu", 0, [(10, 16)], 0.0)
     assert "ms" not in row
-    assert "10 splats at 16 x 16 failed" in row["not_run"]
+    assert str(error) in row["not_run"]
 
 
 @pytest.mark.parametrize("error", [IgsrError("It ended early."), RuntimeError("The GPU is lost.")])
-def test_a_workload_that_fails_takes_no_other_rows_with_it(monkeypatch, tmp_path, error):
+def test_rows_of_other_workloads_survive_a_failure(monkeypatch, tmp_path, error):
     def failing(*arguments):
         raise error
 
@@ -364,24 +323,20 @@ def test_a_workload_that_fails_takes_no_other_rows_with_it(monkeypatch, tmp_path
     assert all(row.keys() >= run.COLUMNS.keys() for row in rows)
 
 
-def test_models_for_w3_are_fitted_once(tmp_path):
+def test_models_for_w3_are_fitted_once_by_seed_and_steps(tmp_path, monkeypatch):
     capture = made_up.capture(views=4, size=32)
-    fitted = fit_rows.fitted_model
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fit_rows, "FIT_STEPS", 5)
-        first = fitted(capture, 200, tmp_path, 0)
-        patch.setattr(fit_rows, "fit", None)
-        again = fitted(capture, 200, tmp_path, 0)
+    monkeypatch.setattr(fit_rows, "FIT_STEPS", 5)
+    first = fit_rows.fitted_model(capture, 200, tmp_path, 0)
+    monkeypatch.setattr(fit_rows, "fit_capture", None)
+    again = fit_rows.fitted_model(capture, 200, tmp_path, 0)
     assert first.means.tobytes() == again.means.tobytes()
-    # Another seed or another fit is another model.
     paths = {fit_rows.model_path(capture, 200, tmp_path, seed) for seed in (0, 1)}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fit_rows, "FIT_STEPS", 6)
-        paths.add(fit_rows.model_path(capture, 200, tmp_path, 0))
-    assert len(paths) == 3
+    monkeypatch.setattr(fit_rows, "FIT_STEPS", 6)
+    assert fit_rows.model_path(capture, 200, tmp_path, 0) not in paths
+    assert len(paths) == 2
 
 
-def test_a_models_folder_that_takes_no_file_is_found_before_the_work(monkeypatch, tmp_path):
+def test_the_models_folder_is_checked_before_the_work(monkeypatch, tmp_path):
     capture = made_up.write_capture(tmp_path / "photos", made_up.capture(views=4, size=32))
     monkeypatch.setattr(run, "rasterize_rows", None)
     settings = run.Settings(
@@ -402,34 +357,29 @@ def test_the_page_names_every_setting(tmp_path):
         assert f"| SH degree {degree} | cpu |" in page
     assert "| SH degree 4, antialiased | cpu |" in page
     errors = [row["setting_mean_error"] for row in report["rows"][::2]]
-    # More degrees are nearer to all of them; the antialiased mode is nearer to many samples.
     assert errors[0] > errors[3] > 0
     assert errors[5] < errors[4]
     with Image.open(tmp_path / accuracy.PLOT_NAME) as plot:
         assert plot.width > 500
 
 
-# ---- two builds ---------------------------------------------------------------------------------
-
-
 def test_two_builds_take_turns(tmp_path):
     copy = shutil.copy(_core.__file__, tmp_path / "_core.abi3.so")
-    report = build_pairs.compare_builds(Path(copy), ("cpu",), ("W1",), 0, 0.0, rounds=2)
-    assert report["machine"]["protocol"] == build_pairs.PAIR_PROTOCOL
+    report = two_builds.compare_builds(Path(copy), ("cpu",), ("W1",), 0, 0.0, rounds=2)
+    assert report["machine"]["protocol"] == two_builds.PAIR_PROTOCOL
     assert [row["pass"] for row in report["rows"]] == ["rasterize", "rasterize_backward"]
     for row in report["rows"]:
-        # The same code: no more apart than a busy machine makes it.
         assert 0.2 < row["ratio_least"] <= row["ratio"] <= row["ratio_most"] < 5.0
         assert 0.0 < row["mean_error_old"] == row["mean_error_new"] < 1e-5
         assert row["max_error_old"] == row["max_error_new"] < 1e-4
 
 
-def test_a_build_is_used_in_place_of_the_packages_own(tmp_path):
+def test_another_build_replaces_the_packages(tmp_path):
     copy = str(shutil.copy(_core.__file__, tmp_path / "_core.abi3.so"))
     code = (
-        "import sys; from igsr_lab.bench.other_build import use_build; use_build(sys.argv[1]);"
-        "from igsr_lab.bench import fit_rows, stage_rows, timed_work;"
-        "print({module._core.__file__ for module in (fit_rows, stage_rows, timed_work)});"
+        "import sys; from igsr._internal.other_build import use_build; use_build(sys.argv[1]);"
+        "from igsr_lab.bench import fit_rows, stage_rows, two_builds;"
+        "print({module._core.__file__ for module in (fit_rows, stage_rows, two_builds)});"
         "use_build(sys.argv[1])"
     )
     done = subprocess.run([sys.executable, "-c", code, copy], capture_output=True, text=True)
@@ -437,77 +387,35 @@ def test_a_build_is_used_in_place_of_the_packages_own(tmp_path):
     assert "in use already" in done.stderr
 
 
-def test_what_is_no_build_is_one_sentence(igsr_bench, tmp_path):
-    (tmp_path / "_core.abi3.so").write_bytes(b"not a module")
-    for file, words in (
-        (tmp_path / "_core.abi3.so", "could not be run"),
-        (tmp_path / "none.so", "no file"),
-    ):
-        status, out, err = igsr_bench("--backend", "cpu", "--workload", "W1", "--compare", file)
-        assert (status, out) == (1, "")
-        assert words in err
-        assert "--compare" in err
-
-
-def test_a_build_without_a_function_is_a_row_that_says_so(monkeypatch):
-    class Old:
-        def ask(self, name, seconds):
-            return {"failed": "AttributeError: no time_rasterize"}
-
-    rows = build_pairs._pair_rows({"workload": "W1"}, Old(), Old(), "W1 20000 400", 0.0, 2)
-    assert [row["not_run"] for row in rows] == [
-        "the old build failed: AttributeError: no time_rasterize"
-    ]
-    assert build_pairs.slower_rows(rows, 10.0) == []
-
-
-def test_a_failure_of_this_build_is_told():
-    class Fine:
-        def ask(self, name, seconds):
-            return {"fit step": [1.0, 2.0]}
-
-    class Broken:
-        def ask(self, name, seconds):
-            return {"failed": "ValueError: no"}
-
+@pytest.mark.parametrize(
+    ("failing", "slower"),
+    [("old", []), ("new", ["W4 with 5 splats on cpu: the new build failed: ValueError: no."])],
+)
+def test_a_failing_build_has_a_row_with_the_reason(failing, slower):
+    answers = {build: {"fit step": [1.0, 2.0]} for build in ("old", "new")}
+    answers[failing] = {"failed": "ValueError: no"}
     size = {"workload": "W4", "splats": 5, "backend": "cpu"}
-    rows = build_pairs._pair_rows(size, Fine(), Broken(), "W4 5 8", 0.0, 2)
-    assert build_pairs.slower_rows(rows, 10.0) == [
-        "W4 with 5 splats on cpu: the new build failed: ValueError: no."
-    ]
+    old, new = (
+        SimpleNamespace(ask=lambda *question, build=build: answers[build]) for build in answers
+    )
+    rows = two_builds.pair_rows(size, old, new, "W4 5 8", 0.0, 2)
+    assert [row["not_run"] for row in rows] == [f"the {failing} build failed: ValueError: no"]
+    assert two_builds.slower_rows(rows, 10.0) == slower
 
 
 def test_slower_builds_are_named():
     size = {"splats": 5, "width": 8, "height": 8, "backend": "cpu", "workload": "W1"}
     rows = [{**size, "pass": name, "ratio": ratio} for name, ratio in (("a", 0.92), ("b", 0.8))]
-    assert build_pairs.slower_rows(rows, 10.0) == [
+    assert two_builds.slower_rows(rows, 10.0) == [
         "W1 b with 5 splats at 8 x 8 on cpu takes 25 % longer."
     ]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["--fail-above", "10"], "--compare FILE"),
-        (["--compare", "a.so", "--fail-above", "-1"], "--fail-above"),
-        (["--compare", "a.so", "--workload", "W2"], "leave W2 and W3 out"),
-        (["--compare", "a.so", "--plot", "p.png"], "leave --plot out"),
-    ],
-)
-def test_options_that_do_not_go_together(igsr_bench, arguments, words):
-    status, out, err = igsr_bench("--backend", "cpu", *arguments)
-    assert (status, out) == (1, "")
-    assert words in err
-
-
-# ---- the command --------------------------------------------------------------------------------
-
-
-def test_bench_writes_machine_and_rows(igsr_bench, tmp_path):
+def test_bench_writes_machine_and_rows(lab_here, tmp_path):
     arguments = ["--backend", "cpu", "--workload", "W1", "--workload", "W2", "--workload", "W3"]
     files = ["--json", tmp_path / "rows.json", "--plot", tmp_path / "plot.png"]
-    status, out, err = igsr_bench(*arguments, "--seconds", "0", *files)
-    assert status == 0, err
+    done = lab_here("bench", *arguments, "--seconds", "0", *files)
+    assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / "rows.json").read_text())
     assert report.keys() == {"machine", "rows"}
     assert report["machine"].keys() >= {"igsr", "seed", "protocol", "threads", "peak_gflops"}
@@ -520,82 +428,79 @@ def test_bench_writes_machine_and_rows(igsr_bench, tmp_path):
     assert [row["pass"] for row in ran] == ["rasterize", "rasterize_backward"]
     for row in ran:
         checked_row(row)
-    # What lacked its file is named with the option that gives it, in the file and on the screen.
     lines = not_run_lines(report["rows"])
     assert len(lines) == 3
     assert "--garden" in lines[0]
     assert "--capture" in lines[1]
-    assert all(line in out for line in lines)
+    assert all(line in done.stdout for line in lines)
     with Image.open(tmp_path / "plot.png") as plot:
         assert plot.width > 500
+
+
+W3 = ["--workload", "W3"]
+PAGE = ["--accuracy", "page.md"]
+BUILD = ["--compare", "a.so"]
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--garden", "nowhere.npz"], "nowhere.npz"),
-        (["--capture", "nowhere"], "nowhere"),
-        (["--seconds", "-1"], "--seconds"),
-        (["--seconds", "nan"], "--seconds"),
-        (["--seed", "-1"], "--seed"),
-        (["--json", "/dev/null/rows.json"], "rows.json"),
+        ([*W3, "--garden", "nowhere.npz"], "nowhere.npz"),
+        ([*W3, "--capture", "nowhere"], "nowhere"),
+        ([*W3, "--seconds", "-1"], "--seconds"),
+        ([*W3, "--seconds", "nan"], "--seconds"),
+        ([*W3, "--seed", "-1"], "--seed"),
+        ([*W3, "--json", "/dev/null/rows.json"], "rows.json"),
+        ([*PAGE, *W3], "--accuracy runs no workloads; leave --workload out"),
+        ([*PAGE, "--garden", "a.npz"], "leave --garden out"),
+        ([*PAGE, "--capture", "a"], "leave --capture out"),
+        ([*PAGE, "--models", "a"], "leave --models out"),
+        (["--fail-above", "10"], "--compare FILE"),
+        ([*BUILD, "--fail-above", "-1"], "--fail-above"),
+        ([*BUILD, *W3], "leave W2 and W3 out"),
+        ([*BUILD, "--plot", "p.png"], "leave --plot out"),
+        ([*BUILD, "--workload", "W1"], "could not be run"),
+        (["--compare", "none.so"], "no file none.so; give --compare"),
     ],
 )
-def test_bad_arguments_are_one_sentence(igsr_bench, arguments, words):
-    status, out, err = igsr_bench("--backend", "cpu", "--workload", "W3", *arguments)
-    assert status == 1
-    assert out == ""
-    assert words in err
-    assert err.endswith(".\n")
-    assert err.count("\n") == 1
+def test_a_bad_argument_is_one_sentence(lab_here, tmp_path, monkeypatch, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    Path("a.so").write_bytes(b"not a module")
+    done = lab_here("bench", "--backend", "cpu", *arguments)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert words in done.stderr
+    assert done.stderr.endswith(".\n")
+    assert done.stderr.count("\n") == 1
 
 
-@pytest.mark.parametrize(
-    "option",
-    [["--workload", "W1"], ["--garden", "a.npz"], ["--capture", "a"], ["--models", "a"]],
-)
-def test_accuracy_takes_no_options_of_workloads(igsr_bench, tmp_path, option):
-    status, out, err = igsr_bench("--accuracy", tmp_path / "page.md", *option)
-    assert (status, out) == (1, "")
-    assert err == f"--accuracy runs no workloads; leave {option[0]} out.\n"
-
-
-def test_a_workload_that_is_not_there_is_refused(igsr_bench):
-    status, _, err = igsr_bench("--workload", "W9")
-    assert status == 2
-    assert "W9" in err
+def test_an_unknown_workload_is_refused(lab_here):
+    done = lab_here("bench", "--workload", "W9")
+    assert done.returncode == 2
+    assert "W9" in done.stderr
 
 
 @pytest.mark.parametrize(
     "memory", [{"bytes_per_splat": 900.0, "contract_bytes_per_splat": 760.0}, {}]
 )
-def test_growth_is_drawn(tmp_path, memory):
+def test_growth_is_plotted(tmp_path, memory):
     rows = [
-        {
-            "workload": "W4",
-            "pass": "fit step",
-            "backend": "cpu",
-            "splats": count,
-            "width": side,
-            "ms": 1.0 * count * side,
-            **memory,
-        }
+        {**size_row("W4", "cpu", count, side, side), "ms": 1.0 * count * side, **memory}
         for count, side in growth.points()
     ]
-    report = {"machine": machine.describe_machine(["cpu"], 0), "rows": rows}
+    report = {"machine": describe_machine(["cpu"], 0), "rows": rows}
     plot_speed_vs_error(tmp_path / "growth.png", report)
     with Image.open(tmp_path / "growth.png") as plot:
         assert plot.width > 500
 
 
-def test_the_peak_is_measured_and_wants_a_time():
+def test_the_peak_needs_a_valid_time():
     assert _core.peak_multiply_add(0.001) > 0.1
     for seconds in (-1.0, float("nan"), float("inf")):
         with pytest.raises(ValueError, match="seconds"):
             _core.peak_multiply_add(seconds)
 
 
-def test_the_example_with_its_own_loss_gains_on_its_start(tmp_path, monkeypatch, capsys):
+def test_the_example_with_a_custom_loss_learns(tmp_path, monkeypatch, capsys):
     capture = made_up.write_capture(tmp_path, made_up.capture(views=4, size=32))
 
     def psnr_after(steps):

@@ -1,4 +1,4 @@
-"""``python -m igsr_lab bench --report``: the page and the figures that a person sends of a GPU."""
+"""``python -m igsr_lab bench --report`` and ``gpu-check``: the page about a GPU and its figures."""
 
 from __future__ import annotations
 
@@ -7,9 +7,7 @@ import sys
 import time
 import types
 
-import numpy as np
 import pytest
-import torch
 
 import igsr
 from igsr import _core
@@ -23,7 +21,7 @@ from igsr_lab.commands import gpu_check
 
 @pytest.fixture
 def small(monkeypatch):
-    """The ball of a report in a second."""
+    """Small scenes."""
     monkeypatch.setattr(gpu_report, "GROWN_COUNT", 200)
     monkeypatch.setattr(gpu_report, "GROWN_SIDE", 32)
     monkeypatch.setattr(gpu_report, "SMALL_BALL", (200, 32))
@@ -32,8 +30,8 @@ def small(monkeypatch):
     monkeypatch.setattr(viewer_rows, "SMALL_SPLATS", 300)
 
 
-def report_of(monkeypatch, tmp_path, tests=None, workloads=("W2",)):
-    settings = benchmark.Settings(backends=("gpu",), workloads=workloads, seconds=0.0)
+def report_of(tmp_path, workload, tests=None):
+    settings = benchmark.Settings(backends=("gpu",), workloads=(workload,), seconds=0.0)
     report = benchmark.device_report(settings)
     path = tmp_path / "report.html"
     benchmark.write_device_report(path, {**report, "tests": tests})
@@ -41,8 +39,11 @@ def report_of(monkeypatch, tmp_path, tests=None, workloads=("W2",)):
 
 
 @pytest.mark.usefixtures("small")
-def test_the_page_has_device_limits_times_and_errors(monkeypatch, tmp_path):
-    page, figures = report_of(monkeypatch, tmp_path)
+def test_the_page_has_the_device_times_errors_and_failed_tests(tmp_path):
+    tests = {"command": "cargo", "passed": 3, "failed": ["a_test"], "seconds": 1.0, "error": "<b>"}
+    page, figures = report_of(tmp_path, "W2", tests)
+    assert all(words in page for words in ("1 failed", "a_test", "&lt;b&gt;"))
+    assert figures["tests"] == tests
     device = figures["device"]
     assert device["name"] in page
     assert device["driver_info"] in page
@@ -61,14 +62,13 @@ def test_the_page_has_device_limits_times_and_errors(monkeypatch, tmp_path):
     assert (frame["splats"], frame["width"], frame["height"]) == (300, 64, 48)
     assert {"project", "sort"} <= frame["stages_ms"].keys()
     assert frame["off_of_255"] <= 4
-    # What did not run says why.
     assert "W2 on gpu not run: it needs gsplat" in page
     if gsplat_rows.why_not():
         assert f"ball on gsplat not run: {gsplat_rows.why_not()}" in page
 
 
 @pytest.mark.usefixtures("small")
-def test_a_software_driver_has_a_small_w4_and_its_name_says_so(monkeypatch, tmp_path):
+def test_a_software_driver_has_a_small_w4(monkeypatch, tmp_path):
     ran = []
 
     def rows(backend, seed, grid=None, seconds=0.0, name="W4"):
@@ -77,42 +77,32 @@ def test_a_software_driver_has_a_small_w4_and_its_name_says_so(monkeypatch, tmp_
 
     monkeypatch.setattr(run, "growth_rows", rows)
     monkeypatch.setattr(run, "pair_rows", lambda backend, seed, seconds: [])
-    kind = _core.gpu_report()["kind"]
-    page, _ = report_of(monkeypatch, tmp_path, workloads=("W4",))
-    if kind == gpu_report.SOFTWARE:
+    page, _ = report_of(tmp_path, "W4")
+    if _core.gpu_report()["kind"] == gpu_report.SOFTWARE:
         assert ran == [(run.SMALL_POINTS, "W4 small")]
         assert "W4 small on gpu not run: only asked" in page
     monkeypatch.setattr(gpu_report, "SOFTWARE", "none")
     ran.clear()
-    report_of(monkeypatch, tmp_path, workloads=("W4",))
+    report_of(tmp_path, "W4")
     assert ran == [(None, "W4")]
 
 
-def test_a_viewer_that_fails_is_one_message(monkeypatch):
+def test_a_failing_viewer_is_one_message(monkeypatch):
     monkeypatch.setattr(viewer_rows, "SMALL_SPLATS", 10)
     with pytest.raises(IgsrError, match=r"size: .*0x48"):
         viewer_rows.viewer_rows((0, 48), 0, True)
-    monkeypatch.setattr(viewer_rows, "TIMEOUT", 0.0)
+    monkeypatch.setattr(viewer_rows, "TIMEOUT_SECONDS", 0.0)
     with pytest.raises(IgsrError, match="took longer than 0 s"):
         viewer_rows.viewer_rows((64, 48), 0, True)
 
 
-@pytest.mark.usefixtures("small")
-def test_failed_tests_stand_out(monkeypatch, tmp_path):
-    tests = {"command": "cargo", "passed": 3, "failed": ["a_test"], "seconds": 1.0, "error": "<b>"}
-    page, figures = report_of(monkeypatch, tmp_path, tests)
-    assert "1 failed" in page
-    assert "a_test" in page
-    assert "&lt;b&gt;" in page
-    assert figures["tests"] == tests
+def test_the_page_has_the_reason_for_no_device(monkeypatch, tmp_path):
+    why = "backend gpu: no adapter answers"
 
-
-def test_without_a_device_the_page_says_why(monkeypatch, tmp_path):
     def fails():
-        raise RuntimeError("backend gpu: no adapter answers")
+        raise RuntimeError(why)
 
     monkeypatch.setattr(_core, "gpu_report", fails)
-    why = "backend gpu: no adapter answers"
     device = gpu_report.describe_device()
     assert device == {"name": None, "error": why}
     machine = benchmark.run_benchmark(benchmark.Settings(("cpu",), ()))["machine"]
@@ -121,7 +111,7 @@ def test_without_a_device_the_page_says_why(monkeypatch, tmp_path):
     assert why in path.read_text()
 
 
-def test_a_report_is_a_page(tmp_path):
+def test_a_report_ends_in_html(tmp_path):
     with pytest.raises(IgsrError, match=r"ends in \.html"):
         benchmark.json_beside(tmp_path / "report.json")
 
@@ -134,8 +124,8 @@ print("test third ... ", end="", flush=True)
 """
 
 
-def test_tests_that_do_not_end_are_ended_and_named(tmp_path):
-    # What hangs is the program of tests that cargo started, which keeps cargo's output open.
+def test_hanging_tests_are_killed_and_named(tmp_path):
+    # cargo's child hangs and keeps cargo's output open.
     sign = tmp_path / "sign"
     child = f"import time\nwhile True: open({str(sign)!r}, 'a').write('.'); time.sleep(0.02)"
     waits = f"{PRINTS}\nimport subprocess, sys; subprocess.run([sys.executable, '-c', {child!r}])"
@@ -145,10 +135,10 @@ def test_tests_that_do_not_end_are_ended_and_named(tmp_path):
     assert found["seconds"] >= 4.0
     written = sign.stat().st_size
     time.sleep(0.5)
-    assert sign.stat().st_size == written > 0, "what the command started goes on"
+    assert sign.stat().st_size == written > 0, "the child was not killed"
 
 
-def test_tests_run_one_by_one_and_say_what_failed():
+def test_failed_tests_are_named():
     ends = PRINTS + "print('ok'); raise SystemExit(101)"
     found = gpu_check.run_tests([sys.executable, "-c", ends])
     assert (found["passed"], found["failed"], found["error"]) == (2, ["second"], "")
@@ -159,39 +149,20 @@ def test_tests_run_one_by_one_and_say_what_failed():
     assert "no device" in found["error"]
 
 
-def made_up_gsplat(draws):
+def fake_gsplat(draws):
     module = types.ModuleType("gsplat")
     module.__version__ = "0"
     module.rasterization = draws
     return module
 
 
-def test_gsplat_gets_the_scene_in_its_own_terms(monkeypatch):
-    scene = shot_of(0, 30, 16).scene
-    calls = []
-
-    def draws(means, quats, scales, opacities, colors, viewmats, Ks, width, height, **more):
-        calls.append((scales.detach(), opacities.detach(), Ks, more["backgrounds"].shape))
-        value = means.sum() + quats.sum() + scales.sum() + opacities.sum() + colors.sum()
-        return value.expand(1, height, width, 3), value.expand(1, height, width, 1), {}
-
-    monkeypatch.setitem(sys.modules, "gsplat", made_up_gsplat(draws))
-    rows = gsplat_rows.gsplat_rows("ball", scene, upstream(0, 16, 16), 0.0, "cpu")
-    assert [row["pass"] for row in rows] == ["forward", "backward"]
-    assert all(row["ms"] >= 0.0 and row["backend"] == "gsplat" for row in rows)
-    scales, opacities, Ks, backgrounds = calls[0]
-    np.testing.assert_allclose(scales, np.exp(scene.splats["scales"]), rtol=1e-6)
-    assert torch.all((opacities > 0.0) & (opacities < 1.0))
-    assert Ks.shape == (1, 3, 3)
-    assert Ks[0, 0, 0] == scene.intrinsics[0]
-    assert backgrounds == (1, 3)
-    assert min(row["max_error"] for row in rows) > 1.0  # a picture of nothing, and of no splats
-
-
-def test_gsplats_rows_have_the_errors_that_igsrs_have(monkeypatch):
-    monkeypatch.setitem(sys.modules, "gsplat", made_up_gsplat(igsr.rasterization))
+def test_gsplat_gets_the_scene_and_its_rows_have_errors(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gsplat", fake_gsplat(igsr.rasterization))
     scene = shot_of(0, 30, 16).scene
     picture, gradients = gsplat_rows.gsplat_rows("ball", scene, upstream(0, 16, 16), 0.0, "cpu")
+    for row, kind in ((picture, "forward"), (gradients, "backward")):
+        assert (row["pass"], row["backend"]) == (kind, "gsplat")
+        assert row["ms"] > 0.0
     assert picture["error_of"] == "picture"
     assert 0.0 < picture["max_error"] < 1e-5
     assert gradients["error_of"] == "gradients"
@@ -199,10 +170,10 @@ def test_gsplats_rows_have_the_errors_that_igsrs_have(monkeypatch):
     assert gradients["worst"].startswith("v_")
 
 
-def test_a_gsplat_that_fails_is_one_message(monkeypatch):
+def test_a_failing_gsplat_is_one_message(monkeypatch):
     def fails(**given):
         raise TypeError("unexpected keyword")
 
-    monkeypatch.setitem(sys.modules, "gsplat", made_up_gsplat(fails))
+    monkeypatch.setitem(sys.modules, "gsplat", fake_gsplat(fails))
     with pytest.raises(IgsrError, match="gsplat 0 failed: unexpected keyword"):
         gsplat_rows.gsplat_rows("ball", shot_of(0, 30, 16).scene, upstream(0, 16, 16), 0.0, "cpu")

@@ -1,4 +1,4 @@
-"""The study ``own-photos``: folders of photos end to end, kept runs, paired differences."""
+"""Study ``own_photos``: folders of photos from cameras to scores, kept runs, differences."""
 
 from __future__ import annotations
 
@@ -13,16 +13,15 @@ from PIL import Image
 
 import igsr
 from igsr.capture import Capture
-from igsr.pose import registry
+from igsr.pose import find
 from igsr.pose.estimate import Estimate
-from igsr_lab.study import own_photo_folders as study
-from igsr_lab.study import own_photos_runs as runs
-from igsr_lab.study.own_photos_tables import differences
-from igsr_lab.study.photo_scenes import photo_scenes
+from igsr_lab.study import Study, own_photos, own_photos_study
+from igsr_lab.study.own_photos_report import differences
+from igsr_lab.study.own_photos_study import photo_scenes
 
 BALL = scenes.splats(30)
-#: Options of a study that is over at once.
-QUICK = {"seeds": 1, "holdout": 4, "steps": 20}
+#: Options of a study that takes no time.
+QUICK = {"holdout": 4, "steps": 20}
 
 
 @pytest.fixture(scope="module")
@@ -31,12 +30,12 @@ def made():
 
 
 @pytest.fixture
-def here(made, monkeypatch):
-    """Runs in this process, with an estimator that knows the cameras of all photos but the last."""
-    monkeypatch.setattr(study, "in_a_process", lambda work, *given: work(*given))
+def calls(made, monkeypatch):
+    """Runs in this process, with an estimator that places all photos except the last."""
+    monkeypatch.setattr(own_photos_study, "in_a_process", lambda work, *given: work(*given))
     calls = []
 
-    def known(photos, *, seed=0, progress=None):
+    def known(photos, options, seed, progress):
         calls.append(len(photos))
         if len(photos) < 5:
             raise igsr.IgsrError("No cameras found: too few matches.")
@@ -44,9 +43,7 @@ def here(made, monkeypatch):
         nothing = [None] * len(photos)
         return Estimate(cameras, None, nothing, nothing, ["one was not placed"])
 
-    entry = registry.Entry(lambda: known, lambda options: True)
-    for name in registry.ESTIMATORS:
-        monkeypatch.setitem(registry.ESTIMATORS, name, entry)
+    monkeypatch.setattr(find, "auto_estimate", known)
     return calls
 
 
@@ -65,19 +62,14 @@ def data(made, tmp_path):
     return tmp_path / "data"
 
 
-def test_folders_of_photos_end_to_end(here, data, tmp_path):
-    squeezenet_file(tmp_path / "features.npz")
-    told = []
-    report = study.own_photos(
-        data,
-        tmp_path / "out",
-        compare="3dgs",
-        features=tmp_path / "features.npz",
-        left_half=True,
-        on_run=lambda done, total, row: told.append(row),
-        **QUICK,
-    )
-    assert here == [8, 3]
+def test_folders_of_photos_are_fitted_and_scored(calls, data, tmp_path):
+    features = tmp_path / "features.npz"
+    squeezenet_file(features)
+    seen = []
+    study = Study(data, tmp_path / "out", seeds=1, on_run=lambda done, total, row: seen.append(row))
+    options = {"compare": "3dgs", "features": features, "left_half": True, **QUICK}
+    report = own_photos(study, **options)
+    assert calls == [8, 3]
     before, after = report["runs"]
     assert (before["preset"], after["preset"]) == ("3dgs", "default")
     assert (after["photos"], after["placed"], after["train_photos"]) == (8, 7, 5)
@@ -103,59 +95,44 @@ def test_folders_of_photos_end_to_end(here, data, tmp_path):
     assert "* few: No cameras found: too few matches." in table
     assert (tmp_path / "out/study.png").stat().st_size > 1000
 
-    # Nothing is done again; another option of the fits leaves the cameras as they are.
-    count = len(told)
-    again = study.own_photos(
-        data, tmp_path / "out", compare="3dgs", features=tmp_path / "features.npz",
-        left_half=True, **QUICK, on_run=lambda done, total, row: told.append(row),
-    )  # fmt: skip
-    assert again == report
-    assert len(told) == count
-    study.own_photos(data, tmp_path / "out", scenes=("ball",), max_size=30, **QUICK,
-                     on_run=lambda done, total, row: told.append(row))  # fmt: skip
-    assert len(here) == 2
-    assert told[count:] == [told[-1]]
-    assert told[-1]["fit_size"] == told[-1]["score_size"] == [30, 30]
+    # Finished runs are kept; another size keeps the cameras.
+    count = len(seen)
+    assert own_photos(study, **options) == report
+    assert len(seen) == count
+    own_photos(study, scenes=("ball",), max_size=30, **QUICK)
+    assert len(calls) == 2
+    assert seen[count:] == [seen[-1]]
+    assert seen[-1]["fit_size"] == seen[-1]["score_size"] == [30, 30]
 
 
-def test_photos_are_scored_at_one_size_whatever_was_fitted(here, data, tmp_path):
-    (row,) = study.own_photos(
-        data, tmp_path / "out", scenes=("ball",), max_size=20, score_size=32, **QUICK
-    )["runs"]
+def test_photos_are_scored_at_one_size(calls, data, tmp_path):
+    study = Study(data, tmp_path / "out", seeds=1)
+    report = own_photos(study, scenes=("ball",), max_size=20, score_size=32, **QUICK)
+    (row,) = report["runs"]
     assert (row["fit_size"], row["score_size"]) == ([20, 20], [32, 32])
 
 
-def test_known_cameras_are_used_only_where_asked_for(here, made, tmp_path):
-    everything = [replace(view, split="train") for view in made.views]
-    scenes.write_capture(tmp_path / "data/ball", Capture(made.path, everything))
-    folder = next(path for path in (tmp_path / "data/ball").iterdir() if path.is_dir())
-    if folder.name != "images":
-        folder.rename(folder.with_name("images"))
-        cameras = tmp_path / "data/ball/transforms.json"
-        cameras.write_text(cameras.read_text().replace(f"{folder.name}/", "images/"))
-    (row,) = study.own_photos(tmp_path / "data", tmp_path / "a", known_cameras=True, **QUICK)[
-        "runs"
+def test_known_cameras_are_used_only_if_asked_for(calls, made, tmp_path):
+    views = [
+        replace(view, name=view.name.replace("photos/", "images/"), split="train")
+        for view in made.views
     ]
-    assert here == []
+    scenes.write_capture(tmp_path / "data/ball", Capture(made.path, views))
+    study = Study(tmp_path / "data", tmp_path / "a", seeds=1)
+    (row,) = own_photos(study, known_cameras=True, **QUICK)["runs"]
+    assert calls == []
     assert list(row["parts"]) == ["decode", "fit", "score"]
     assert row["placed"] == row["photos"] == 8
-    (row,) = study.own_photos(tmp_path / "data", tmp_path / "b", **QUICK)["runs"]
-    assert here == [8]
+    (row,) = own_photos(replace(study, out=tmp_path / "b"), **QUICK)["runs"]
+    assert calls == [8]
     assert row["placed"] == 7
 
 
-def test_moved_cameras_are_those_that_fitted_photos_are_scored_with(here, data, tmp_path):
-    options = {**QUICK, "steps": 60}
-    (row,) = study.own_photos(
-        data, tmp_path / "out", scenes=("ball",), preset="instantsplat", score_size=30, **options
-    )["runs"]
+def test_fitted_photos_are_scored_with_moved_cameras(calls, data, tmp_path):
+    study = Study(data, tmp_path / "out", seeds=1)
+    options = {"preset": "instantsplat", "score_size": 30, **QUICK, "steps": 60}
+    (row,) = own_photos(study, scenes=("ball",), **options)["runs"]
     assert row["train_psnr"] > row["psnr"]
-
-
-def test_cameras_at_another_size_see_the_same(made):
-    view = made.views[0]
-    smaller = replace(view.camera, K=np.diag([0.5, 0.5, 1.0]) @ view.camera.K, width=20, height=20)
-    assert runs._with_camera(view, smaller).camera == view.camera
 
 
 def row(scene, preset, seed, values, **more):
@@ -185,25 +162,24 @@ def test_differences_are_paired_by_photo_and_seed():
     assert "ms_ssim" not in found["mean"], "no photo has it"
 
 
-def test_which_folders_are_scenes(data, made, tmp_path):
+def test_folders_with_photos_are_scenes(data, tmp_path):
     assert photo_scenes(data) == (data, ["ball", "few"])
     assert photo_scenes(data, ["few"]) == (data, ["few"])
     assert photo_scenes(data / "ball") == (data, ["ball"])
     assert photo_scenes(data.parent, ["data/few"]) == (data.parent, ["data/few"])
-    for where, names, message in (
+    for folder, names, message in (
         (tmp_path / "nowhere", None, "does not exist"),
         (data / "text", None, "holds no photos and no folder with photos"),
         (data, ["text"], "text holds no photos; name another --scene"),
         (data, ["few", "few/"], "few/ is named twice"),
     ):
         with pytest.raises(igsr.IgsrError, match=message):
-            photo_scenes(where, names)
+            photo_scenes(folder, names)
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"seeds": 0}, "seeds must be at least 1, not 0"),
         ({"max_size": 0}, "max_size must be at least 1, not 0"),
         ({"score_size": -1}, "score_size must be at least 1"),
         ({"steps": 0}, "steps must be at least 1"),
@@ -214,23 +190,15 @@ def test_which_folders_are_scenes(data, made, tmp_path):
         ({"features": "missing.npz"}, "missing.npz"),
     ],
 )
-def test_what_cannot_be_used_is_told_before_anything_slow(here, data, tmp_path, options, message):
+def test_bad_arguments_are_refused_before_cameras_are_searched(
+    calls, data, tmp_path, options, message
+):
     with pytest.raises(igsr.IgsrError, match=message):
-        study.own_photos(data, tmp_path / "out", **options)
-    assert here == []
+        own_photos(Study(data, tmp_path / "out"), **options)
+    assert calls == []
 
 
-def test_a_study_does_not_write_into_a_scene(here, data):
+def test_a_study_does_not_write_into_a_scene(calls, data):
     with pytest.raises(igsr.IgsrError, match="name another --out"):
-        study.own_photos(data / "few", data / "few/out", **QUICK)
+        own_photos(Study(data / "few", data / "few/out"), **QUICK)
     assert not (data / "few/out").exists()
-
-
-def test_a_process_that_dies_is_a_sentence():
-    import os
-
-    from igsr._internal.worker_processes import in_a_process
-
-    assert in_a_process(os.getpid) != os.getpid()
-    with pytest.raises(igsr.IgsrError, match="may have run out of memory"):
-        in_a_process(os._exit, 9)

@@ -1,9 +1,9 @@
-"""``python -m igsr_lab study``: the protocol's views, rows that survive, sums that are right."""
+"""Studies ``blender8`` and ``few_photos``: splits, kept runs, tables."""
 
 from __future__ import annotations
 
 import json
-import shutil
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -12,36 +12,30 @@ import scenes
 from ray_stand_in import stand_in_ray
 
 import igsr
-from igsr._internal.resumable_jobs import folder_hash
+from igsr_lab.resumable_jobs import folder_hash
 from igsr.capture import Capture
-from igsr.fitting.presets import PRESETS, preset_settings
-from igsr.fitting.settings import FitSettings
-from igsr_lab.study import blender, blender8, few_photos
-from igsr_lab.study import scored_fits as fits
-from igsr_lab.study.blender import VIEW_IDS
-from igsr_lab.study.real_captures import load_views
-from igsr_lab.study.scored_fits import Fit, run_fit
-from igsr_lab.study.splits import dtu_views, llff_views, with_train_views
-from igsr_lab.study.summary import summarized
-
-#: A preset that is over at once.
-SHORT = FitSettings(
-    steps=20,
-    max_splats=300,
-    sh_degree=0,
-    density="fixed",
-    dropout=0.0,
-    start="random",
-    coarse_to_fine=False,
-    depth_weight=0.0,
-    learning_rate=1.0,
-    poses="fixed",
-    focal="fixed",
-    exposure="off",
-    transients="off",
-    remove_floaters=False,
-    backdrop=False,
+from igsr_lab.presets import PRESETS, preset_settings
+from igsr_lab.study import Study, blender8, few_photos, preset_fits
+from igsr_lab.study.preset_fits import (
+    SCORES,
+    VIEW_IDS,
+    Fit,
+    load_blender8,
+    load_few_photos,
+    run_fit,
 )
+from igsr_lab.study.splits import dtu_views, llff_views, with_train_views
+from igsr_lab.study.study import summarized
+
+#: Keywords of a preset that takes no time.
+SHORT = {
+    "steps": 20,
+    "max_splats": 300,
+    "sh_degree": 0,
+    "density": "fixed",
+    "transients": "off",
+    "start": "random",
+}
 
 
 @pytest.fixture(scope="module")
@@ -65,41 +59,43 @@ def real(tmp_path_factory):
     return folder
 
 
-def stand_in(one, psnr):
-    """The row of a fit that was not made."""
+def fake_row(fit, psnr):
     scores = {"psnr": psnr, "ssim": 0.9, "flip": 0.1, "splats": 10, "seconds": 1.0}
-    return {**vars(one), **scores, "protocol": {"views": 2, "ssim": "window", "flip": "LDR"}}
+    return {**vars(fit), **scores, "protocol": {"views": 2, "ssim": "window", "flip": "LDR"}}
 
 
-def test_the_protocols_views_are_fitted(data):
+def names(views):
+    return [int(view.name.removeprefix("photos/").removesuffix(".png")) for view in views]
+
+
+def test_blender8_fits_the_views_of_the_protocol(data):
     capture = igsr.load_capture(data / "ball")
     chosen = with_train_views(capture, VIEW_IDS["75"])
-    names = [view.name for view in chosen.train_views]
-    assert names == [f"photos/{i:02d}.png" for i in (26, 86, 2, 55, 75, 93, 16, 73)]
+    assert names(chosen.train_views) == [26, 86, 2, 55, 75, 93, 16, 73]
     assert len(chosen.test_views) == 2
-    few = Capture(capture.path, capture.views[:50])
     with pytest.raises(igsr.IgsrError, match="needs number 93"):
-        with_train_views(few, VIEW_IDS["75"])
+        with_train_views(Capture(capture.path, capture.views[:50]), VIEW_IDS["75"])
 
 
-def test_a_study_is_written_and_goes_on_where_it_stopped(data, tmp_path, monkeypatch):
+def test_a_study_continues_after_an_interruption(data, tmp_path, monkeypatch):
     done = []
 
-    def quick(load, folder, one):
-        done.append(one)
+    def quick(load, folder, fit):
+        done.append(fit)
         if len(done) == 3:
             raise igsr.IgsrError("out of patience")
-        return stand_in(one, 20.0 + one.seed + (one.preset == "default"))
+        return fake_row(fit, 20.0 + fit.seed + (fit.preset == "default"))
 
-    monkeypatch.setattr(fits, "run_fit", quick)
-    options = {"scenes": ("ball",), "views": ("75",), "presets": ("default", "3dgs"), "seeds": 2}
+    monkeypatch.setattr(preset_fits, "run_fit", quick)
+    study = Study(data, tmp_path / "out", seeds=2)
+    options = {"scenes": ("ball",), "views": ("75",), "presets": ("default", "3dgs")}
     with pytest.raises(igsr.IgsrError, match="out of patience"):
-        blender8(data, tmp_path / "out", **options)
+        blender8(study, **options)
     assert len(list((tmp_path / "out/runs").iterdir())) == 2
-    report = blender8(data, tmp_path / "out", **options)
-    assert len(done) == 5, "two were not done again"
+    report = blender8(study, **options)
+    assert len(done) == 5
     settings = preset_settings("default", 8) | {"data": folder_hash(data / "ball")}
-    assert report["runs"][0]["settings"] == settings
+    assert report["runs"][0]["settings"] == settings, "fits of other photos are repeated"
     assert report == json.loads((tmp_path / "out/study.json").read_text())
     assert report["mean"]["default"]["psnr"] == 21.5
     assert report["mean"]["default"]["psnr_spread"] == pytest.approx(np.sqrt(0.5))
@@ -108,29 +104,18 @@ def test_a_study_is_written_and_goes_on_where_it_stopped(data, tmp_path, monkeyp
     assert "| mean | all | default | 21.50 ± 0.71 |" in table
     assert (tmp_path / "out/study.png").stat().st_size > 1000
 
-    # A preset that has changed since is fitted again.
+    # Fits with other settings are repeated.
     file = tmp_path / "out/runs/ball-views75-default-seed0-cpu.json"
     row = json.loads(file.read_text())
     row["settings"]["steps"] += 1
     file.write_text(json.dumps(row))
-    assert blender8(data, tmp_path / "out", **options) == report
+    assert blender8(study, **options) == report
     assert len(done) == 6
 
-    # And so are photos that have.
-    changed = tmp_path / "data"
-    shutil.copytree(data, changed)
-    photo = next((changed / "ball").rglob("*.png"))
-    photo.write_bytes(photo.read_bytes() + b"\0")
-    blender8(changed, tmp_path / "out", **options)
-    assert len(done) == 6 + 4
 
-
-def test_a_real_fit_of_the_study(data, monkeypatch):
-    from igsr.fitting import presets
-
-    short = replace(SHORT, steps=30, dropout=0.2, start="auto")
-    monkeypatch.setattr(presets, "_default", lambda *_: short)
-    row = run_fit(blender.load_views, str(data), Fit("ball", "76", "default", 1, "cpu"))
+def test_photos_are_fitted_and_scored(data, monkeypatch):
+    monkeypatch.setattr(preset_fits, "preset_keywords", lambda preset, capture: SHORT)
+    row = run_fit(load_blender8, str(data), Fit("ball", "76", "default", 1, "cpu"))
     assert row["psnr"] > 10.0
     assert row["splats"] <= 300
     assert row["protocol"]["views"] == 2
@@ -138,53 +123,38 @@ def test_a_real_fit_of_the_study(data, monkeypatch):
 
 
 def test_spread_is_over_seeds_not_scenes():
-    rows = [
-        {"seed": seed, "psnr": psnr, "ssim": 1.0, "flip": 0.0, "splats": 1, "seconds": 1.0}
-        for seed, psnr in [(0, 10.0), (0, 30.0), (1, 12.0), (1, 32.0)]
-    ]
-    summary = summarized(rows)
-    assert summary["psnr"] == 21.0
-    assert summary["psnr_spread"] == pytest.approx(np.sqrt(2.0))
-    assert summarized(rows[:1])["psnr_spread"] is None
+    psnrs = [(0, 10.0), (0, 30.0), (1, 12.0), (1, 32.0)]
+    rows = [{"seed": seed, "psnr": psnr} for seed, psnr in psnrs]
+    summary = summarized(rows, ["psnr"])
+    assert summary == {"fits": 4, "psnr": 21.0, "psnr_spread": pytest.approx(np.sqrt(2.0))}
+    assert summarized(rows[:1], ["psnr"])["psnr_spread"] is None
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("run", "options", "message"),
     [
-        ({"scenes": ("leaf",), "views": ("three",)}, "views must be numbers of photos, such as 3"),
-        ({"scenes": ("leaf",), "views": ("18",)}, "views must be from 1 to 17, not 18"),
-        ({"scenes": ("nothing",)}, "nothing does not exist"),
-        ({"scenes": ("leaf",), "presets": ("best",)}, "preset must be one of"),
-        ({"scenes": ("leaf",), "jobs": 0}, "at least 1"),
+        (few_photos, {"views": ("three",)}, "views must be numbers of photos, such as 3"),
+        (few_photos, {"views": ("18",)}, "views must be from 1 to 17, not 18"),
+        (few_photos, {"scenes": ("nothing",)}, "nothing does not exist"),
+        (few_photos, {"presets": ("best",)}, "preset must be one of"),
+        (blender8, {"scenes": ("nothing",)}, "nothing holds no transforms_train.json"),
+        (blender8, {"views": ("77",)}, "views must be of 75, 76"),
     ],
 )
-def test_bad_arguments_of_few_photos(real, tmp_path, options, message):
+def test_bad_arguments_are_refused_before_the_first_fit(real, tmp_path, run, options, message):
     with pytest.raises(igsr.IgsrError, match=message):
-        few_photos(real, tmp_path, **options)
+        run(Study(real, tmp_path), **{"scenes": ("leaf",), **options})
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"scenes": ("nothing",)}, "nothing holds no transforms_train.json"),
-        ({"scenes": ("ball",), "views": ("77",)}, "views must be of 75, 76"),
-        ({"scenes": ("ball",), "presets": ("best",)}, "preset must be one of"),
-        ({"scenes": ("ball",), "seeds": 0}, "at least 1"),
-    ],
-)
-def test_bad_arguments(data, tmp_path, options, message):
-    with pytest.raises(igsr.IgsrError, match=message):
-        blender8(data, tmp_path, **options)
+@pytest.mark.parametrize("name", ["seeds", "jobs"])
+def test_a_study_needs_a_seed_and_a_job(tmp_path, name):
+    with pytest.raises(igsr.IgsrError, match=f"{name} must be at least 1, not 0"):
+        Study(tmp_path, tmp_path, **{name: 0})
 
 
-def names(views):
-    return [int(view.name.removeprefix("photos/").removesuffix(".png")) for view in views]
-
-
-def test_llff_holds_out_every_8th_photo_and_spreads_the_rest():
+def test_llff_holds_out_every_8th_photo():
     capture = scenes.capture(views=20, size=16)
-    # Whatever order a file has them in.
     chosen = llff_views(Capture(capture.path, capture.views[::-1]), 3)
     assert names(chosen.test_views) == [0, 8, 16]
     assert names(chosen.train_views) == [1, 10, 19]
@@ -195,91 +165,91 @@ def test_llff_holds_out_every_8th_photo_and_spreads_the_rest():
             llff_views(capture, count)
 
 
-def test_dtu_has_its_own_photos():
+def test_dtu_has_a_list_of_train_photos():
     capture = scenes.capture(views=49, size=16)
     chosen = dtu_views(capture, 6)
     assert names(chosen.train_views) == [25, 22, 28, 40, 44, 48]
     assert sorted(names(chosen.views)) == list(range(49))
     with pytest.raises(igsr.IgsrError, match="views must be from 1 to 9 for DTU, not 10"):
         dtu_views(capture, 10)
-    few = Capture(capture.path, capture.views[:40])
     with pytest.raises(igsr.IgsrError, match="has 40 photos; DTU's protocol needs number 48"):
-        dtu_views(few, 6)
+        dtu_views(Capture(capture.path, capture.views[:40]), 6)
 
 
-def test_few_photos_has_a_row_by_scene_views_and_preset(real, tmp_path, monkeypatch):
+def test_few_photos_has_a_row_by_scene_views_and_preset(real, tmp_path, monkeypatch, lab_here):
     seen = []
 
-    def quick(load, folder, one, refined):
-        seen.append((one.scene, len(load(folder, one).train_views)))
-        return stand_in(one, float(one.views)) | {"psnr_refined": float(one.views) + 0.5}
+    def quick(load, folder, fit, refined):
+        seen.append((fit.scene, len(load(folder, fit).train_views)))
+        return fake_row(fit, float(fit.views)) | {"psnr_refined": float(fit.views) + 0.5}
 
-    monkeypatch.setattr(fits, "run_fit", quick)
-    report = few_photos(real, tmp_path, scenes=("leaf", "dtu_1"), seeds=1)
+    monkeypatch.setattr(preset_fits, "run_fit", quick)
+    study = ["study", "few-photos", real, "--out", tmp_path, "--scene", "leaf", "--scene", "dtu_1"]
+    done = lab_here(*study, "--seeds", "1")
+    assert done.returncode == 0, done.stderr
+    assert f"1 of {6 * len(PRESETS)}: leaf views 3 default seed 0: 3.00 dB" in done.stderr
     assert seen[:: len(PRESETS)] == [(scene, n) for scene in ("leaf", "dtu_1") for n in (3, 6, 9)]
+    report = json.loads((tmp_path / "study.json").read_text())
     assert set(report["mean"]) == set(PRESETS)
     assert report["scenes"]["dtu_1"]["6"]["default"]["psnr"] == 6.0
     split = report["protocol"]["scenes"]["dtu_1"]
     assert split["split"] == "DTU"
     assert split["train_views"]["3"] == [f"photos/{i}.png" for i in (25, 22, 28)]
-    table = (tmp_path / "study.md").read_text()
-    assert "| preset | PSNR, dB | refined PSNR, dB | SSIM |" in table
-    assert "| leaf | 9 | default | 9.00 | 9.50 |" in table
+    assert "| preset | PSNR, dB | refined PSNR, dB | SSIM |" in done.stdout
+    assert "| leaf | 9 | default | 9.00 | 9.50 |" in done.stdout
+    refused = lab_here(*study, "--views", "18")
+    assert refused.returncode == 1
+    assert "leaf has 17 photos" in refused.stderr
 
 
-def test_presets_that_move_cameras_are_scored_refined_too(real, monkeypatch):
-    from igsr.fitting import presets
-
-    short = replace(SHORT, poses="joint", focal="shared")
-    monkeypatch.setattr(presets, "_INSTANTSPLAT", short)
-    one = Fit("leaf", "3", "instantsplat", 0, "cpu")
-    row = run_fit(load_views, str(real), one, refined=True)
-    assert row["psnr_refined"] > row["psnr"], "a camera fitted to its photo scores better"
-    assert "psnr_refined" not in run_fit(load_views, str(real), one)
+def test_test_cameras_are_refined_for_presets_that_move_cameras(real, monkeypatch):
+    joint = {**SHORT, "poses": "joint"}
+    monkeypatch.setattr(preset_fits, "preset_keywords", lambda preset, capture: joint)
+    fit = Fit("leaf", "3", "instantsplat", 0, "cpu")
+    row = run_fit(load_few_photos, str(real), fit, refined=True)
+    assert row["psnr_refined"] > row["psnr"]
+    assert "psnr_refined" not in run_fit(load_few_photos, str(real), fit)
 
 
-def test_what_a_mask_hides_in_a_scored_photo_changes_no_score(real, monkeypatch):
-    from igsr.fitting import presets
-
-    monkeypatch.setattr(presets, "_3DGS", SHORT)
+def test_masked_pixels_of_scored_photos_do_not_count(real, monkeypatch):
+    monkeypatch.setattr(preset_fits, "preset_keywords", lambda preset, capture: SHORT)
     mask = np.zeros((16, 16), dtype=bool)
     mask[3:13, 4:14] = True
 
-    def scored_with(spoil):
-        def load(folder, one):
-            capture = load_views(folder, one)
+    def scored_with(value):
+        def load(folder, fit):
+            capture = load_few_photos(folder, fit)
             views = []
             for view in capture.views:
                 image = view.image.copy()
                 if view.split == "test":
-                    image[~mask] = spoil
+                    image[~mask] = value
                 views.append(replace(view, image=image, mask=mask))
             return Capture(capture.path, views)
 
         row = run_fit(load, str(real), Fit("leaf", "3", "3dgs", 0, "cpu"))
-        return {name: row[name] for name in fits.SCORES}, row["protocol"]
+        return {name: row[name] for name in SCORES}, row["protocol"]
 
     assert scored_with(0) == scored_with(255)
     assert "masked pixels left out" in scored_with(0)[1]["pixels"]
 
 
-def test_fits_over_ray_are_the_same_and_errors_come_through(data, tmp_path, monkeypatch):
-    import sys
-
-    def quick(load, folder, one):
-        if one.seed == 1 and one.preset == "3dgs":
+def test_fits_on_ray_are_the_same_and_errors_come_through(data, tmp_path, monkeypatch):
+    def quick(load, folder, fit):
+        if fit.seed == 1 and fit.preset == "3dgs":
             raise igsr.IgsrError("out of patience")
-        return stand_in(one, 20.0 + one.seed)
+        return fake_row(fit, 20.0 + fit.seed)
 
-    monkeypatch.setattr(fits, "run_fit", quick)
+    monkeypatch.setattr(preset_fits, "run_fit", quick)
     options = {"scenes": ("ball",), "views": ("75",), "presets": ("default", "3dgs")}
-    here = blender8(data, tmp_path / "here", seeds=1, **options)
+    here = blender8(Study(data, tmp_path / "here", seeds=1), **options)
     ray = stand_in_ray(monkeypatch)
-    assert blender8(data, tmp_path / "there", seeds=1, ray=True, **options) == here
+    on_ray = Study(data, tmp_path / "there", seeds=1, ray=True)
+    assert blender8(on_ray, **options) == here
     assert (1, {"RAYON_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}) in ray.environments
     with pytest.raises(igsr.IgsrError, match=r"^out of patience$"):
-        blender8(data, tmp_path / "there", seeds=2, ray=True, **options)
+        blender8(replace(on_ray, seeds=2), **options)
     assert not ray.running
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(igsr.IgsrError, match="igsr\\[ray\\]"):
-        blender8(data, tmp_path / "nowhere", seeds=1, ray=True, **options)
+        blender8(replace(on_ray, out=tmp_path / "nowhere"), **options)

@@ -1,8 +1,8 @@
-"""The page of accuracy: every implementation at every setting that trades error for time.
+"""The page about accuracy: every implementation at every setting that trades error for time.
 
-One small scene, so that even the reference's own time can be measured. Two errors are told apart:
-that of the arithmetic, an implementation against the f64 reference at the same setting; and that of
-the setting itself, the f64 reference at that setting against the f64 reference without it.
+The scene is small, so that the reference can be timed, too. There are two errors: that of the
+arithmetic, an implementation against the f64 reference at the same setting; and that of the
+setting, the f64 reference with it against the f64 reference without.
 """
 
 from __future__ import annotations
@@ -19,37 +19,29 @@ from igsr import _core
 from igsr._internal.atomic_write import atomic_write
 from igsr.splats import MAX_SH_DEGREE
 from igsr_lab.bench import oracle
-from igsr_lab.bench.comparison import BOUND_3D, FLIP
-from igsr_lab.bench.machine import describe_machine
+from igsr_lab.bench.comparison import BOUND_3D, MIN_FLIP
 from igsr_lab.bench.plots import plot_speed_vs_error
 from igsr_lab.bench.scenes import Arrays, Scene, ball
 from igsr_lab.bench.stage_rows import pipeline_rows
-from igsr_lab.bench.table import machine_line, milliseconds
+from igsr_lab.bench.table import describe_machine, machine_line, milliseconds
+from igsr_lab.report_parts import markdown_table
 
-#: The scene: small enough for the reference to walk all splats at every pixel, and its splats about
-#: a pixel in size, where antialiasing matters.
-COUNT, WIDTH, HEIGHT, SIZE = 2000, 128, 96, 0.4
-#: How long one row is repeated.
+#: The scene: few splats of about a pixel, whose antialiasing matters.
+COUNT = 2000
+WIDTH, HEIGHT = 128, 96
+SIZE = 0.4
+#: Time that a row is repeated.
 SECONDS = 1.0
-#: Samples per pixel along each axis of the picture that nothing is left out of.
+#: Samples per pixel along each axis of the exact picture.
 SAMPLES = 8
-#: Longest line of the page's text, characters.
-LONGEST_LINE = 100
+#: Maximum length of the page's lines.
+MAX_LINE = 100
 PLOT_NAME = "speed_vs_error.png"
-
-Table = list[list[str]]
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One way to draw the scene.
-
-    Attributes:
-        name: what it is called.
-        scene: the scene with it.
-        against: what its own error is measured against.
-        whole: that picture, f64.
-    """
+    """One way to render the scene, and the f64 picture ``against`` which its error is measured."""
 
     name: str
     scene: Scene
@@ -58,7 +50,7 @@ class Setting:
 
 
 def settings(scene: Scene) -> list[Setting]:
-    """Every setting: SH degrees against the highest, then both modes against many samples."""
+    """SH degrees against the highest, then both modes against many samples."""
     top = replace(scene, sh_degree=MAX_SH_DEGREE)
     highest, many = _reference_picture(top), many_samples(top)
     degrees = [
@@ -80,10 +72,9 @@ def settings(scene: Scene) -> list[Setting]:
 
 
 def many_samples(scene: Scene) -> Arrays:
-    """The scene's picture in f64 with ``SAMPLES``^2 samples per pixel in place of the blur.
+    """The picture in f64 with ``SAMPLES``^2 samples per pixel instead of the blur.
 
-    A sample keeps the renderer's blur in its own, finer pixels, so that no splat falls between
-    samples.
+    Samples have the renderer's blur at their finer size, so that none misses a splat.
     """
     fine = replace(
         scene,
@@ -106,7 +97,7 @@ def _reference_picture(scene: Scene) -> Arrays:
 
 
 def setting_columns(setting: Setting) -> dict[str, Any]:
-    """A setting's name and its own error, for each of its rows."""
+    """Name and error of a setting, for its rows."""
     image = _reference_picture(setting.scene)
     difference = np.maximum(
         np.abs(image["color"] - setting.whole["color"]).max(axis=2),
@@ -127,18 +118,10 @@ def measure_accuracy(
     on_row: Callable[[str], object] = lambda doing: None,
     scene: Scene | None = None,
 ) -> dict[str, Any]:
-    """``{"machine": ..., "rows": [...]}``; each row names its setting.
-
-    Args:
-        backends: names as ``resolved_backends`` returns them.
-        seed: of the scene.
-        seconds: spent on each time.
-        on_row: called with each row when it is measured.
-        scene: to measure on; None is the default scene of ``seed``.
-    """
+    """Measure every setting; return ``{"machine": ..., "rows": [...]}``."""
     scene = ball(seed, COUNT, WIDTH, HEIGHT, MAX_SH_DEGREE, SIZE) if scene is None else scene
     machine = describe_machine(list(backends), seed)
-    on_row("what the settings leave out")
+    on_row("errors of the settings")
     rows: list[dict[str, Any]] = []
     for setting in settings(scene):
         columns = setting_columns(setting)
@@ -150,15 +133,7 @@ def measure_accuracy(
 
 
 def write_accuracy(path: Path, report: dict[str, Any]) -> None:
-    """Write the page, and its plot beside it.
-
-    Args:
-        path: of the Markdown page.
-        report: of ``measure_accuracy``.
-
-    Raises:
-        IgsrError: a file cannot be written.
-    """
+    """Write the Markdown page and its plot."""
     plot_speed_vs_error(path.with_name(PLOT_NAME), report)
     with atomic_write(path) as temporary:
         temporary.write_text(accuracy_page(report), encoding="utf-8")
@@ -166,27 +141,26 @@ def write_accuracy(path: Path, report: dict[str, Any]) -> None:
 
 def accuracy_page(report: dict[str, Any]) -> str:
     """The page in Markdown."""
-    machine, rows = report["machine"], report["rows"]
+    rows = report["rows"]
     first = rows[0]
     compared = min(row["compared_pixels"] for row in rows)
     left_out = max(row["left_out_pixels"] for row in rows)
-    figures: Table = []
-    for forward, backward in zip(rows[::2], rows[1::2], strict=True):
-        figures.append(
-            [
-                forward["setting"],
-                forward["backend"],
-                milliseconds(forward["ms"]),
-                milliseconds(backward["ms"]),
-                _scientific(forward["max_error"]),
-                _scientific(forward["mean_error"]),
-                f"{_scientific(backward['max_error'])} ({backward['worst']})",
-                _scientific(backward["mean_error"]),
-                str(forward["band_pixels"]),
-                str(forward["left_out_pixels"]),
-            ]
-        )
-    own = {
+    figures = [
+        [
+            forward["setting"],
+            forward["backend"],
+            milliseconds(forward["ms"]),
+            milliseconds(backward["ms"]),
+            _scientific(forward["max_error"]),
+            _scientific(forward["mean_error"]),
+            f"{_scientific(backward['max_error'])} ({backward['worst']})",
+            _scientific(backward["mean_error"]),
+            str(forward["band_pixels"]),
+            str(forward["left_out_pixels"]),
+        ]
+        for forward, backward in zip(rows[::2], rows[1::2], strict=True)
+    ]
+    of_settings = {
         row["setting"]: [
             row["setting"],
             row["setting_against"],
@@ -195,86 +169,66 @@ def accuracy_page(report: dict[str, Any]) -> str:
         ]
         for row in rows
     }
-    headings = ["setting", "implementation", "forward, ms", "backward, ms", "picture: max", "mean"]
-    headings += ["gradients: max", "mean", "band pixels", "left out"]
-    return _wrapped(
-        [
-            "# Accuracy",
-            "",
-            "Written by `make accuracy`; do not edit.",
-            "",
-            f"Measured with {machine_line(machine)}. The scene: {first['splats']} splats of about "
-            f"a pixel on {first['width']}×{first['height']}; {compared} of its "
-            f"{first['width'] * first['height']} pixels are compared, of which a line of the table "
-            f"leaves out {left_out} at most. Gradients are of a random loss over colour, alpha and "
-            "depth.",
-            "",
-            "## The arithmetic",
-            "",
-            "Each implementation against the f64 reference at the same setting, on the same f32 "
-            "splats. The reference's own line compares its walk over all splats with the culled "
-            "one that the others are compared with: culling leaves out only pairs that contribute "
-            "nothing. "
-            "Gradients are in parts of the largest of their kind, for the worst kind. A pixel of "
-            "the [band](numerics.md#bounds-and-what-is-measured) is left out only where it differs "
-            f"by more than the bound, {max(BOUND_3D.values()):g}, or its transmittance by more "
-            f"than {FLIP:g} of itself.",
-            "",
-            *_markdown(headings, figures, left=2),
-            "",
-            f"![time against largest error of every setting]({PLOT_NAME})",
-            "",
-            "## The settings",
-            "",
-            "What a setting itself leaves out, in f64: lower SH degrees against the highest, the "
-            "plain and the antialiased mode against a picture that many samples per pixel make "
-            "sharp instead of the blur. These splats draw all degrees and are small; a fitted "
-            "scene holds less of the higher degrees and is closer to what it was fitted to.",
-            "",
-            *_markdown(["setting", "against", "max", "mean"], list(own.values()), left=2),
-            "",
-            "## What is no setting",
-            "",
-            "* **The exponential.** One polynomial on the cpu (relative error below 1.2e-7 over "
-            "all that can be seen, a test) and the device's own on the gpu; there is no coarser "
-            "one.",
-            "* **Tile culling.** Only the exact one: no pair with alpha ≥ 1/255 is lost, so "
-            "it trades nothing.",
-            "* **Storage.** f32 everywhere; nothing is kept in half precision.",
-            "",
-            "## How it is measured",
-            "",
-            machine["protocol"],
-            "",
-        ]
+    heads = ["setting", "implementation", "forward, ms", "backward, ms", "picture: max", "mean"]
+    heads += ["gradients: max", "mean", "band pixels", "left out"]
+    lines = [
+        "# Accuracy",
+        "",
+        "Written by `make accuracy`; do not edit.",
+        "",
+        f"Measured with {machine_line(report['machine'])}. The scene: {first['splats']} splats of "
+        f"about a pixel on {first['width']}×{first['height']}; {compared} of its "
+        f"{first['width'] * first['height']} pixels are compared, and a line of the table leaves "
+        f"out at most {left_out} of them. Gradients are of a random loss over color, alpha and "
+        "depth.",
+        "",
+        "## Arithmetic",
+        "",
+        "Each implementation against the f64 reference at the same setting, on the same f32 "
+        "splats. The reference's line compares the reference over all splats with the culled one "
+        "that is used here: culling only leaves out pairs that contribute nothing. Gradient errors "
+        "are relative to the largest of their kind, for the worst kind. A pixel of the "
+        "[band](numerics.md#bounds-and-what-is-measured) is left out only if it differs by more "
+        f"than the bound, {max(BOUND_3D.values()):g}, or its transmittance by more than "
+        f"{MIN_FLIP:g} of itself.",
+        "",
+        *markdown_table(heads, figures, left=2),
+        "",
+        f"![time against largest error of every setting]({PLOT_NAME})",
+        "",
+        "## Settings",
+        "",
+        "The error of each setting in f64: lower SH degrees against the highest, the plain and the "
+        "antialiased mode against a picture with many samples per pixel instead of the blur. "
+        "These splats use all degrees and are small; fitted scenes have weaker higher degrees and "
+        "smaller errors.",
+        "",
+        *markdown_table(["setting", "against", "max", "mean"], of_settings.values(), left=2),
+        "",
+        "## Fixed choices",
+        "",
+        "* **The exponential.** One polynomial on the cpu (relative error below 1.2e-7 over the "
+        "visible range, which a test checks) and the device's on the gpu.",
+        "* **Tile culling.** Exact: no pair with alpha ≥ 1/255 is lost.",
+        "* **Storage.** f32 everywhere; nothing is kept in half precision.",
+        "",
+        "## Protocol",
+        "",
+        report["machine"]["protocol"],
+        "",
+    ]
+    return "\n".join(wrapped for line in lines for wrapped in _wrapped(line))
+
+
+def _wrapped(line: str) -> list[str]:
+    """Wrap a paragraph; tables stay as they are."""
+    if len(line) <= MAX_LINE or line.startswith("|"):
+        return [line]
+    indent = "  " if line.startswith("* ") else ""
+    return textwrap.wrap(
+        line, MAX_LINE, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
     )
-
-
-def _wrapped(lines: list[str]) -> str:
-    """The lines with paragraphs wrapped to fit a screen; tables stay as they are."""
-    wrapped = []
-    for line in lines:
-        indent = "  " if line.startswith("* ") else ""
-        wrap = len(line) > LONGEST_LINE and not line.startswith("|")
-        wrapped += (
-            textwrap.wrap(
-                line,
-                LONGEST_LINE,
-                subsequent_indent=indent,
-                break_long_words=False,
-                break_on_hyphens=False,
-            )
-            if wrap
-            else [line]
-        )
-    return "\n".join(wrapped)
 
 
 def _scientific(value: float) -> str:
     return "0" if value == 0.0 else f"{value:.1e}"
-
-
-def _markdown(headings: list[str], rows: Table, left: int) -> list[str]:
-    """A Markdown table; columns after the first ``left`` are numbers."""
-    rule = ["---" if column < left else "---:" for column in range(len(headings))]
-    return ["| " + " | ".join(line) + " |" for line in [headings, rule, *rows]]

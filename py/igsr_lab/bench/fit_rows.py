@@ -1,7 +1,7 @@
-"""Rows of whole fit steps (W3): the built-in fit, and a loop of one's own through autograd.
+"""Rows of whole fit steps (W3): the built-in fit, and a custom loop through autograd.
 
-The gradients of a fit step are the fit's own: after one step from moments of zero, Adam's first
-moments hold a tenth of them. The expected ones come from the f64 reference and a loss in f64.
+Gradients are compared with the f64 reference and a loss in f64. Those of the built-in fit are read
+from Adam's first moments: after one step from zero, they are a tenth of the gradients.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from igsr import _core
 from igsr._internal.choices import Backend
 from igsr.capture import Capture, View
 from igsr.errors import IgsrError
-from igsr.fitting.fit_capture import fingerprint, fit
+from igsr.fitting.fingerprint import fingerprint
+from igsr.fitting.fit_capture import fit_capture
 from igsr.rendering.rasterization import rasterization
 from igsr.rendering.renders import intrinsics_of, viewmat_about
 from igsr.splats import Splats
@@ -35,47 +36,48 @@ from igsr_lab.bench.comparison import (
     errors_row,
     gradient_error,
     picture_error,
+    size_row,
 )
 from igsr_lab.bench.scenes import PARAMETERS, Arrays, Scene
 from igsr_lab.bench.stage_rows import MIN_REPEATS, SECONDS, timing_row
 
-#: Views that a step is timed on; they differ in what they show.
+#: Number of views that a step is timed on.
 VIEWS = 4
-#: Steps from one state before it is set up anew: more would fit the model to the one photo.
+#: Steps from one state before it is reset: more would fit the model to the one photo.
 STEPS_PER_STATE = 8
-#: Steps done before, by number only: all SH degrees are in use, the centers' rate has decayed.
-STEPS_BEFORE, STEPS_OF_FIT = 5000, 10_000
-#: What the fit weighs new gradients with in Adam's first moments.
+#: Number of the first step: all SH degrees are in use, the rate of means has decayed.
+FIRST_STEP = 5000
+STEPS_OF_FIT = 10_000
+#: Weight of new gradients in Adam's first moments.
 FIRST_MOMENT = 0.1
-#: A model that is fitted for W3 may fall short of the number of splats by this part.
+#: A model for W3 may have fewer splats by this fraction.
 COUNT_TOLERANCE = 0.05
-#: Relocation lets a model grow by 5 % every 100 steps, from 20 000 to 100 000 splats in 3 300.
+#: Relocation adds 5 % every 100 steps: from 20 000 to 100 000 splats in 3 300.
 FIT_STEPS = 5000
 
-#: The fit's loss: part of D-SSIM, SSIM's window and constants (docs/how-it-works/numerics.md).
+#: The fit's loss: weight of D-SSIM, SSIM's window and constants (docs/how-it-works/numerics.md).
 SSIM_WEIGHT = 0.2
-SSIM_SIGMA, SSIM_SIDE = 1.5, 11
+SSIM_SIGMA_PX = 1.5
+SSIM_SIDE_PX = 11
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
-
-#: Residuals nearer to 0 than this may round to either side of it.
+#: The sign of smaller residuals depends on rounding.
 KINK = 2e-6
-
-#: Charbonnier's smoothing of |x|, in units of the picture's range.
+#: Charbonnier's smoothing of |x|, for colors in [0, 1].
 CHARBONNIER_EPSILON = 1e-3
 
-#: Of a picture, a photo [H, W, 3] and the mask of the pixels that count [H, W].
+#: From a picture and a photo [H, W, 3] and the mask of the pixels that count [H, W].
 Loss = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 @dataclass(frozen=True)
 class Shot:
-    """A scene with raw parameters and the photo that it is fitted to, uint8 [H, W, 3 or 4]."""
+    """A scene with raw parameters and the photo to fit, uint8 [H, W, 3 or 4]."""
 
     scene: Scene
     photo: npt.NDArray[np.uint8]
 
     def target(self) -> npt.NDArray[np.float64]:
-        """The photo over the scene's background, [H, W, 3] in 0..1."""
+        """The photo over the scene's background, [H, W, 3] in [0, 1]."""
         pixels = self.photo.astype(np.float64) / 255.0
         if pixels.shape[2] == 3:
             return pixels
@@ -83,14 +85,8 @@ class Shot:
         return pixels[..., :3] * alpha + self.scene.background * (1.0 - alpha)
 
 
-def shots_of(capture: Capture, splats: Splats) -> list[Shot]:
-    """Some views of a capture, evenly chosen, over white, with a model of it."""
-    views = capture.train_views
-    chosen = [views[i] for i in np.linspace(0, len(views) - 1, min(VIEWS, len(views))).astype(int)]
-    return [_shot(view, splats) for view in chosen]
-
-
 def _shot(view: View, splats: Splats) -> Shot:
+    """A view over white."""
     scene = Scene(
         splats={
             "means": splats.means,
@@ -111,31 +107,26 @@ def _shot(view: View, splats: Splats) -> Shot:
 
 
 def model_path(capture: Capture, count: int, models: Path, seed: int) -> Path:
-    """Where ``fitted_model`` keeps a model; the name holds all that the fit depends on."""
+    """File of ``fitted_model``; its name has everything that the fit depends on."""
     photos = f"{capture.path.resolve().name}-{fingerprint(capture.train_views)[:12]}"
     return models / f"{photos}-{count}-seed{seed}-{FIT_STEPS}steps.ply"
 
 
 def fitted_model(capture: Capture, count: int, models: Path, seed: int) -> Splats:
-    """A model of ``capture`` with ``count`` splats: from the folder ``models``, else fitted.
-
-    Raises:
-        IgsrError: the fit did not reach the number of splats, or the model cannot be written.
-    """
+    """A model of ``capture`` with ``count`` splats: from the folder ``models``, else fitted."""
     path = model_path(capture, count, models, seed)
     if path.is_file():
         return Splats.load(path)
-    # Relocation grows the model up to the number asked for; the original control stops where the
-    # photos ask for no more, and removing floaters would leave fewer.
-    splats = fit(
+    # MCMC grows to the maximum; original density control would stop earlier.
+    splats = fit_capture(
         capture,
-        FIT_STEPS,
+        steps=FIT_STEPS,
         seed=seed,
         max_splats=count,
         density="mcmc",
         remove_floaters=False,
         backdrop=False,
-    )
+    ).splats
     if len(splats) < (1.0 - COUNT_TOLERANCE) * count:
         raise IgsrError(
             f"A fit of {capture.path} ended with {len(splats)} splats, not {count}; "
@@ -145,19 +136,16 @@ def fitted_model(capture: Capture, count: int, models: Path, seed: int) -> Splat
     return splats
 
 
-# ---- the loss in f64, and the gradients it gives ------------------------------------------------
-
-
 def fit_loss(picture: Tensor, photo: Tensor, mask: Tensor) -> Tensor:
-    """The fit's loss on [H, W, 3]: 0.8 L1 + 0.2 (1 - SSIM), zero padding in the window."""
+    """The fit's loss on [H, W, 3]: 0.8 L1 + 0.2 (1 - SSIM), zero-padded."""
     x, y = picture.permute(2, 0, 1)[:, None], photo.permute(2, 0, 1)[:, None]
-    at = torch.arange(SSIM_SIDE, dtype=picture.dtype) - SSIM_SIDE // 2
-    line = torch.exp(-(at**2) / (2.0 * SSIM_SIGMA**2))
+    at = torch.arange(SSIM_SIDE_PX, dtype=picture.dtype) - SSIM_SIDE_PX // 2
+    line = torch.exp(-(at**2) / (2.0 * SSIM_SIGMA_PX**2))
     line = line / line.sum()
     window = (line[:, None] * line[None, :])[None, None]
 
     def mean(values: Tensor) -> Tensor:
-        return conv2d(values, window, padding=SSIM_SIDE // 2)
+        return conv2d(values, window, padding=SSIM_SIDE_PX // 2)
 
     mx, my = mean(x), mean(y)
     xx, yy, xy = mean(x * x) - mx * mx, mean(y * y) - my * my, mean(x * y) - mx * my
@@ -169,30 +157,23 @@ def fit_loss(picture: Tensor, photo: Tensor, mask: Tensor) -> Tensor:
 
 
 def charbonnier(picture: Tensor, photo: Tensor, mask: Tensor | None) -> Tensor:
-    """The smooth L1 of the loop of one's own."""
+    """The custom loop's loss, a smooth L1."""
     difference = picture - photo if mask is None else (picture - photo)[mask]
     return torch.sqrt(difference**2 + CHARBONNIER_EPSILON**2).mean()
 
 
 @dataclass(frozen=True)
 class Expected:
-    """What the reference says of a shot, and how a backend's picture compares.
+    """The reference's gradients for a shot, and the error of a backend's picture."""
 
-    Attributes:
-        gradients: of the loss, without the pixels that do not count.
-        gradients_from_picture: the same, but with the loss's own gradient taken at the backend's
-            picture. A loss that bends sharply, as a rounded L1 does at its tip, makes more of the
-            picture's rounding than the renderer's backward pass adds; this leaves only the latter.
-        picture: error of the backend's picture.
-        band: pixels that may differ, and those that do.
-        mask: bool [H, W], the pixels whose loss counts: none at the kink of L1, and none whose
-            SSIM window holds a pixel that is left out, so that such a pixel has no gradient at all.
-    """
-
-    gradients: Arrays
+    gradients: Arrays  # of the loss
+    #: The same, with the loss's gradient at the backend's picture. This leaves out the picture's
+    #: rounding, which a loss with kinks like L1 amplifies.
     gradients_from_picture: Arrays
-    picture: Error
-    band: Band
+    picture: Error  # error of the backend's picture
+    band: Band  # number of pixels that may differ, and number that do
+    #: bool [H, W], pixels whose loss counts: none at the kink of L1, and none whose SSIM window has
+    #: a pixel that is left out.
     mask: npt.NDArray[np.bool_]
 
 
@@ -214,13 +195,11 @@ def _expected(shot: Shot, loss: Loss, backend: str) -> Expected:
     in_band = oracle.band(exact, crops, shape, oracle.ALPHA_BAND_3D)
     error, band = picture_error(got, image, in_band, BOUND_3D[backend])
     mask = np.ones(shape, dtype=bool)
-    reach = SSIM_SIDE // 2
+    reach = SSIM_SIDE_PX // 2
     for y, x in np.argwhere(band.left_out):
         mask[max(0, y - reach) : y + reach + 1, max(0, x - reach) : x + reach + 1] = False
-    # |x| has no gradient at 0: within rounding of it, its sign is a matter of chance.
     residual = np.abs(image["color"] - shot.target())
     mask &= ~((residual > 0.0) & (residual < KINK)).any(axis=2)
-
     zero = np.zeros(shape)
 
     def gradients_at(picture: npt.NDArray[Any]) -> Arrays:
@@ -236,11 +215,9 @@ def _expected(shot: Shot, loss: Loss, backend: str) -> Expected:
     return Expected(*of_both, error, band, mask)
 
 
-# ---- the built-in fit ---------------------------------------------------------------------------
-
-
-def _state(scene: Scene) -> Arrays:
-    """A fit's state with moments of zero, as if ``STEPS_BEFORE`` steps had been done."""
+def fitter(shot: Shot, backend: str, mask: npt.NDArray[np.bool_] | None = None) -> _core.Fitter:
+    """A fit of the shot's scene to its photo, without density control, from zero moments."""
+    scene = shot.scene
     splats = {"sh" if name == "colors" else name: a for name, a in scene.splats.items()}
     count = len(splats["means"])
     state: Arrays = dict(splats)
@@ -248,17 +225,11 @@ def _state(scene: Scene) -> Arrays:
         state |= {f"{moment}_{name}": np.zeros_like(array) for name, array in splats.items()}
     for statistic in ("grad_sum", "seen"):
         state[f"stats_{statistic}"] = np.zeros(count, np.float32)
-    state["step"] = np.array([STEPS_BEFORE], dtype=np.uint32)
-    return state
-
-
-def fitter(shot: Shot, backend: str, mask: npt.NDArray[np.bool_] | None = None) -> _core.Fitter:
-    """A fit of the shot's scene to its one photo, without density control."""
-    scene = shot.scene
+    state["step"] = np.array([FIRST_STEP], dtype=np.uint32)
     config = {
         "steps": STEPS_OF_FIT,
         "sh_degree": scene.sh_degree,
-        "max_splats": len(scene.splats["means"]),
+        "max_splats": count,
         "density": "fixed",
         "background": scene.background.tolist(),
     }
@@ -269,14 +240,14 @@ def fitter(shot: Shot, backend: str, mask: npt.NDArray[np.bool_] | None = None) 
         [(1, None)],
         scene.viewmat[None],
         scene.intrinsics[None],
-        _state(scene),
+        state,
         config,
         backend,
     )
 
 
 def fit_step_ms(shot: Shot, backend: str, seconds: float) -> list[float]:
-    """Milliseconds per step, each from the scene as it is given (but for a few steps)."""
+    """Milliseconds per step of the built-in fit, each within a few steps of the given scene."""
     times: list[float] = []
     started = time.perf_counter()
     while len(times) < MIN_REPEATS or time.perf_counter() - started < seconds:
@@ -284,19 +255,18 @@ def fit_step_ms(shot: Shot, backend: str, seconds: float) -> list[float]:
         running.step(1)  # allocates, and wakes a device
         before = time.perf_counter()
         running.step(1)
-        # Steps of a GPU are read back once per call; a call holds up to 20 ms of them.
+        # A GPU's steps are read back once per call; a call takes up to 20 ms.
         steps = min(STEPS_PER_STATE, math.ceil(0.02 / (time.perf_counter() - before)))
         for _ in range(STEPS_PER_STATE // steps):
             before = time.perf_counter()
             running.step(steps)
             times.append(1e3 * (time.perf_counter() - before) / steps)
-        # Or the next one's state would stand beside this one's, and count as the fit's memory.
-        del running
+        del running  # or two states would count as the fit's memory
     return times
 
 
-def fit_gradients(shot: Shot, backend: str, mask: npt.NDArray[np.bool_]) -> Arrays:
-    """The gradients of one step of the built-in fit, out of Adam's first moments."""
+def _fit_gradients(shot: Shot, backend: str, mask: npt.NDArray[np.bool_]) -> Arrays:
+    """Gradients of one step of the built-in fit, from Adam's first moments."""
     running = fitter(shot, backend, mask)
     running.step(1)
     state = running.state()
@@ -307,20 +277,15 @@ def fit_gradients(shot: Shot, backend: str, mask: npt.NDArray[np.bool_]) -> Arra
     }
 
 
-# ---- a loop of one's own ------------------------------------------------------------------------
+class CustomLoop:
+    """A fit by ``igsr.rasterization``, torch's Adam and a Charbonnier loss.
 
-
-class OwnLoop:
-    """A fit by ``igsr.rasterization``, torch's Adam and a Charbonnier loss."""
+    Rates are the fit's, constant, except a tenth for means and one rate for all of SH.
+    """
 
     def __init__(
         self, shot: Shot, backend: Backend, mask: npt.NDArray[np.bool_] | None = None
     ) -> None:
-        """Parameters as leaves, at fixed rates.
-
-        They are the fit's, but for the centers', which here is a tenth of the fit's first and knows
-        neither extent nor decay, and for all SH coefficients, which here share that of the first.
-        """
         scene = shot.scene
         self.scene, self.backend = scene, backend
         self.parameters = {
@@ -368,18 +333,13 @@ class OwnLoop:
         self.backward()
         self.optimizer.step()
 
-    def gradients(self) -> Arrays:
-        """The gradients of the last backward pass."""
-        found = {name: tensor.grad for name, tensor in self.parameters.items()}
-        return {f"v_{n}": grad.numpy() for n, grad in found.items() if grad is not None}
 
-
-def own_loop_ms(shot: Shot, backend: Backend, seconds: float) -> list[float]:
-    """Milliseconds per step of the loop of one's own, each nearly from the scene as given."""
+def _custom_loop_ms(shot: Shot, backend: Backend, seconds: float) -> list[float]:
+    """Milliseconds per step of the custom loop, each within a few steps of the given scene."""
     times: list[float] = []
     started = time.perf_counter()
     while len(times) < MIN_REPEATS or time.perf_counter() - started < seconds:
-        loop = OwnLoop(shot, backend)
+        loop = CustomLoop(shot, backend)
         loop.step()
         for _ in range(STEPS_PER_STATE):
             before = time.perf_counter()
@@ -388,51 +348,49 @@ def own_loop_ms(shot: Shot, backend: Backend, seconds: float) -> list[float]:
     return times
 
 
-# ---- rows ---------------------------------------------------------------------------------------
+def _custom_gradients(shot: Shot, backend: Backend, mask: npt.NDArray[np.bool_]) -> Arrays:
+    loop = CustomLoop(shot, backend, mask)
+    loop.backward()
+    found = {name: tensor.grad for name, tensor in loop.parameters.items()}
+    return {f"v_{n}": grad.numpy() for n, grad in found.items() if grad is not None}
 
 
 def step_rows(
     workload: str, shots: list[Shot], backend: str, seconds: float = SECONDS
 ) -> list[dict[str, Any]]:
-    """One step of the built-in fit beside one of the loop of one's own.
+    """One step of the built-in fit, and one of the custom loop.
 
-    The time is the mean over the shots of the fastest step of each; errors are the largest over the
+    The time is the mean over the shots of each one's fastest step. Errors are the largest over the
     shots, and the mean of their means.
     """
     scene = shots[0].scene
+    count = len(scene.splats["means"])
     passes: list[tuple[str, Loss, Any, Any]] = [
-        ("fit step", fit_loss, fit_step_ms, fit_gradients),
-        ("fit step, own loop", charbonnier, own_loop_ms, _own_gradients),
+        ("fit step", fit_loss, fit_step_ms, _fit_gradients),
+        ("fit step, own loop", charbonnier, _custom_loop_ms, _custom_gradients),
     ]
     rows = []
     for name, loss, time_steps, gradients_of in passes:
-        fastest, medians, repeats = [], [], 0
-        compared = []
+        times = [time_steps(shot, backend, seconds / len(shots)) for shot in shots]
+        fastest = np.array([min(ms) for ms in times])
+        pictures, gradients, backwards, bands = [], [], [], []
         for shot in shots:
-            times = time_steps(shot, backend, seconds / len(shots))
-            fastest.append(min(times))
-            medians.append(float(np.median(times)))
-            repeats += len(times)
             expected = _expected(shot, loss, backend)
             got = gradients_of(shot, backend, expected.mask)
-            error = gradient_error(got, expected.gradients)
-            backward = gradient_error(got, expected.gradients_from_picture)
-            compared.append((expected.picture, error, backward, expected.band))
-        pictures, gradients, backwards, bands = zip(*compared, strict=True)
+            pictures.append(expected.picture)
+            gradients.append(gradient_error(got, expected.gradients))
+            backwards.append(gradient_error(got, expected.gradients_from_picture))
+            bands.append(expected.band)
         worst = max(gradients, key=lambda error: error.max)
         rows.append(
             {
-                "workload": workload,
-                "backend": backend,
+                **size_row(workload, backend, count, scene.width, scene.height),
                 "pass": name,
-                "splats": len(scene.splats["means"]),
-                "width": scene.width,
-                "height": scene.height,
                 "views": len(shots),
-                **timing_row(np.array(fastest), backend, None),
+                **timing_row(fastest, backend, None),
                 "ms": float(np.mean(fastest)),
-                "ms_median": float(np.mean(medians)),
-                "repeats": repeats,
+                "ms_median": float(np.mean([np.median(ms) for ms in times])),
+                "repeats": sum(len(ms) for ms in times),
                 **errors_row("gradients", worst, bands[0]),
                 "mean_error": float(np.mean([error.mean for error in gradients])),
                 "max_error_from_picture": max(error.max for error in backwards),
@@ -446,16 +404,11 @@ def step_rows(
     return rows
 
 
-def _own_gradients(shot: Shot, backend: Backend, mask: npt.NDArray[np.bool_]) -> Arrays:
-    loop = OwnLoop(shot, backend, mask)
-    loop.backward()
-    return loop.gradients()
-
-
 def capture_rows(
     capture: Capture, count: int, backend: str, models: Path, seed: int, seconds: float = SECONDS
 ) -> list[dict[str, Any]]:
-    """W3: whole fit steps on a capture after its fit, at ``count`` splats."""
-    return step_rows(
-        "W3", shots_of(capture, fitted_model(capture, count, models, seed)), backend, seconds
-    )
+    """W3: whole fit steps on a fitted capture with ``count`` splats."""
+    splats = fitted_model(capture, count, models, seed)
+    views = capture.train_views
+    indices = np.linspace(0, len(views) - 1, min(VIEWS, len(views))).astype(int)
+    return step_rows("W3", [_shot(views[i], splats) for i in indices], backend, seconds)

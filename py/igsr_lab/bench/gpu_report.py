@@ -1,4 +1,4 @@
-"""A report of one computer's GPU that a person can attach to a message: one page, one JSON file."""
+"""A report about one computer's GPU, to attach to bug reports: a page and a JSON file."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from igsr.errors import IgsrError
 from igsr.evaluation.report_page import write_template
 from igsr_lab.bench.growth import GROWN_COUNT, GROWN_SIDE, shot_of
 from igsr_lab.bench.gsplat_rows import NAME, gsplat_rows, why_not
-from igsr_lab.bench.run import COLUMNS, Settings, not_run, run_benchmark
+from igsr_lab.bench.run import Settings, not_run, rows_or_reason, run_benchmark
 from igsr_lab.bench.scenes import garden, upstream
 from igsr_lab.bench.stage_rows import pipeline_rows
 from igsr_lab.bench.table import milliseconds, not_run_lines
 from igsr_lab.bench.viewer_rows import SIZES, VIEWER, viewer_rows
 
-#: What wgpu calls an adapter that is a program.
+#: wgpu's kind of software adapters.
 SOFTWARE = "Cpu"
-#: Splats and side of that scene where such an adapter draws it.
+#: Splats and side of the ball for software adapters.
 SMALL_BALL = (10_000, 256)
-#: The scene that is drawn beside gsplat's, where no garden is given: W4's, forward and backward.
+#: The scene that gsplat renders, too, if no garden is given: W4's, forward and backward.
 BALL = "ball"
 
 
 def describe_device() -> dict[str, Any]:
-    """Driver, limits and start of the device of the backend "gpu", or why there is none."""
+    """Driver, limits and start times of the device of backend "gpu", or the reason for none."""
     try:
         device = _core.gpu_report()
         opened, compiled, tested = _core.time_gpu_start()
@@ -42,18 +42,10 @@ def describe_device() -> dict[str, Any]:
 def device_report(
     settings: Settings, on_row: Callable[[str], object] = lambda doing: None
 ) -> dict[str, Any]:
-    """The benchmark with what a reader needs to know of the device; see ``run_benchmark``.
+    """Run the benchmark and describe the device; see ``run_benchmark``.
 
-    W2's scene, or W4's ball where no garden is given, is timed by gsplat too. The viewer's frames
-    are timed. Where a software driver stands in for a GPU, scenes are smaller, and W4 says so by
-    its name.
-
-    Args:
-        settings: what to run.
-        on_row: told what is about to run.
-
-    Raises:
-        IgsrError: a file that was given cannot be used.
+    W2's scene, or W4's ball without a garden, is timed with gsplat, too, and the viewer's frames
+    are timed. Software drivers get smaller scenes, and W4 another name.
     """
     on_row("the device")
     device = describe_device()
@@ -70,55 +62,32 @@ def device_report(
         for backend in settings.backends:
             on_row(f"{name} on {backend}")
             work = partial(pipeline_rows, name, scene, backend, settings.seed, settings.seconds)
-            report["rows"] += _rows(name, backend, work)
+            report["rows"] += rows_or_reason(name, backend, work)
     if "gpu" in settings.backends:
         for size in SIZES:
             on_row(f"the viewer at {size[0]} x {size[1]}")
             work = partial(viewer_rows, size, settings.seed, small)
-            report["rows"] += _rows(VIEWER, "gpu", work)
+            report["rows"] += rows_or_reason(VIEWER, "gpu", work)
     on_row(f"{name} on {NAME}")
     reason = why_not()
-    v_image = upstream(settings.seed, scene.width, scene.height)
-    report["rows"] += (
-        [{**COLUMNS, **not_run(name, NAME, reason)}]
-        if reason
-        else _rows(name, NAME, lambda: gsplat_rows(name, scene, v_image, settings.seconds))
-    )
+    if reason:
+        report["rows"].append(not_run(name, NAME, reason))
+    else:
+        v_image = upstream(settings.seed, scene.width, scene.height)
+        work = partial(gsplat_rows, name, scene, v_image, settings.seconds)
+        report["rows"] += rows_or_reason(name, NAME, work)
     return {"device": device, **report}
 
 
-def _rows(name: str, backend: str, work: Callable[[], list[dict[str, Any]]]) -> Any:
-    try:
-        rows = work()
-    except (IgsrError, RuntimeError) as error:
-        rows = [not_run(name, backend, str(error))]
-    return [{**COLUMNS, **row} for row in rows]
-
-
 def json_beside(path: Path) -> Path:
-    """Where the figures of a page go.
-
-    Args:
-        path: of the page.
-
-    Raises:
-        IgsrError: the page's name does not end in .html.
-    """
+    """File of a page's figures."""
     if path.suffix.lower() != ".html":
-        raise IgsrError(f"{path}: a report is a page; give it a name that ends in .html.")
+        raise IgsrError(f"{path}: a report is a page; give a name that ends in .html.")
     return path.with_suffix(".json")
 
 
 def write_device_report(path: Path, report: dict[str, Any]) -> None:
-    """Write the page, and the figures as JSON beside it, each whole or not at all.
-
-    Args:
-        path: of the page.
-        report: of ``device_report``, with "tests" where the kernels' tests were run.
-
-    Raises:
-        IgsrError: a file cannot be written.
-    """
+    """Write the page and the JSON file; the report may have "tests" of the kernels."""
     write_json(json_beside(path), report)
     variables = {
         "machine": report["machine"],

@@ -1,78 +1,71 @@
-"""W4: how time and memory of a fit step grow with splats and pixels.
+"""W4: growth of a fit step's time and memory with splats and pixels.
 
-Each point runs in a process of its own, so that its peak memory is its own. The scene is a ball of
-splats that stays as dense while their number grows, the photo is noise; neither needs a file.
+Each point runs in its own process, for its own peak memory. The scene is a ball of splats whose
+density does not depend on their number, the photo is noise.
 """
 
 from __future__ import annotations
 
 import gc
-import json
-import os
-import subprocess
-import sys
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from igsr._internal.peak_memory import forget_peak, peak_bytes
+from igsr._internal.worker_processes import in_a_process
 from igsr.errors import IgsrError
-from igsr_lab.bench.comparison import errors_row
+from igsr_lab.bench.comparison import errors_row, size_row
 from igsr_lab.bench.fit_rows import Shot, fit_step_ms, step_rows
 from igsr_lab.bench.scenes import ball, upstream
 from igsr_lab.bench.stage_rows import compare, runs_on_cores, timing_row
 
-#: Splats, at GROWN_SIDE pixels a side; and sides, at GROWN_COUNT splats.
+#: Numbers of splats, at GROWN_SIDE pixels a side.
 COUNTS = (10_000, 30_000, 100_000, 300_000, 1_000_000)
+GROWN_SIDE = 512
+#: Sides in pixels, at GROWN_COUNT splats.
 SIDES = (256, 512, 1024, 2048)
-GROWN_SIDE, GROWN_COUNT = 512, 100_000
-#: The points of a GPU's report where a software driver stands in for the GPU: minutes, not hours.
+GROWN_COUNT = 100_000
+#: Splats and sides for software drivers: minutes, not hours.
 SMALL_POINTS = ((10_000, 256), (30_000, 256), (10_000, 512))
-#: Where the loop of one's own is timed beside the built-in fit.
+#: Splats and side for the comparison with the custom loop.
 PAIR = (20_000, 400)
 SH_DEGREE = 2
-#: Few enough splats that what is left is the picture's buffers.
+#: So few splats that the picture's buffers take almost all memory.
 EMPTY = 16
-#: Growth stops where one step takes longer than this.
+#: Larger points do not run if a step takes longer.
 STEP_SECONDS = 20.0
-#: Crops that are compared with the reference, evenly chosen.
+#: Number of crops that are compared with the reference.
 CROPS = 64
-#: How long one point is repeated.
+#: Time that a point is repeated.
 POINT_SECONDS = 1.0
 
 
 def points() -> list[tuple[int, int]]:
-    """(splats, side) of every point, each once, the smaller first."""
+    """Splats and side of every point, the smaller first."""
     return [(count, GROWN_SIDE) for count in COUNTS] + [
         (GROWN_COUNT, side) for side in SIDES if side != GROWN_SIDE
     ]
 
 
 def shot_of(seed: int, count: int, side: int) -> Shot:
-    """The ball before a camera, and a photo of noise."""
+    """A ball of splats and a photo of noise."""
     random = np.random.default_rng([seed, side])
     photo = random.integers(0, 256, (side, side, 3), dtype=np.uint8)
     return Shot(ball(seed, count, side, side, SH_DEGREE), photo)
 
 
 def parameter_bytes(count: int) -> int:
-    """Size of the parameters: 11 numbers of shape and place, and the SH coefficients."""
+    """Size of the parameters: 11 numbers for shape and place, and the SH coefficients."""
     return 4 * count * (11 + 3 * (SH_DEGREE + 1) ** 2)
 
 
-def contract_bytes(count: int) -> int:
-    """2 x parameters + gradients + optimiser state; the picture's buffers come on top."""
-    return 5 * parameter_bytes(count)
-
-
 def measure(seed: int, count: int, side: int, backend: str, seconds: float) -> dict[str, Any]:
-    """Time, memory where it can be told, and error of one point; for a process of its own."""
+    """Time, memory if it is known, and error of one point; for its own process."""
     shot = shot_of(seed, count, side)
-    # What a backend opens once, threads and devices, is not the fit's.
+    # Threads and devices, which are opened once, are not the fit's.
     fit_step_ms(shot_of(seed, EMPTY, 16), backend, 0.0)
-    # The process's size says nothing of the memory that a device has of its own, nor what is below
-    # an earlier peak.
+    # The process's size does not include a device's memory or memory below an earlier peak.
     memory: dict[str, int] = {}
     gc.collect()
     if runs_on_cores(backend) and forget_peak() and (before := peak_bytes()) is not None:
@@ -83,12 +76,8 @@ def measure(seed: int, count: int, side: int, backend: str, seconds: float) -> d
     v_image = upstream(seed, side, side)
     comparison, _ = compare(shot.scene, backend, v_image, evenly_chosen)
     return {
-        "workload": "W4",
-        "backend": backend,
+        **size_row("W4", backend, count, side, side),
         "pass": "fit step",
-        "splats": count,
-        "width": side,
-        "height": side,
         **timing_row(np.array(times), backend, None),
         **memory,
         **errors_row("gradients", comparison.gradients, comparison.band, comparison.picture),
@@ -96,33 +85,10 @@ def measure(seed: int, count: int, side: int, backend: str, seconds: float) -> d
 
 
 def evenly_chosen(crops: list[Any]) -> list[Any]:
-    """``CROPS`` of the crops: enough to tell the error, in seconds."""
+    """Choose ``CROPS`` of the crops."""
     if len(crops) <= CROPS:
         return crops
     return [crops[i] for i in np.linspace(0, len(crops) - 1, CROPS).round().astype(int)]
-
-
-def measure_apart(
-    seed: int, count: int, side: int, backend: str, seconds: float = POINT_SECONDS
-) -> dict[str, Any]:
-    """``measure`` in a child process.
-
-    Raises:
-        IgsrError: the child failed, for example because it ran out of memory.
-    """
-    arguments = json.dumps([seed, count, side, backend, seconds])
-    done = subprocess.run(
-        [sys.executable, "-m", "igsr_lab.bench.growth", arguments],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
-    )
-    if done.returncode != 0:
-        lines = done.stderr.strip().splitlines()
-        reason = lines[-1] if lines else f"it ended with status {done.returncode}"
-        raise IgsrError(f"A fit of {count} splats at {side} x {side} failed: {reason}")
-    row: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    return row
 
 
 def growth_rows(
@@ -132,34 +98,33 @@ def growth_rows(
     seconds: float = POINT_SECONDS,
     name: str = "W4",
 ) -> list[dict[str, Any]]:
-    """W4: the rows of all points, with memory where it can be told; ``name`` is what they go by."""
+    """W4: the rows of all points; ``name`` is the workload's."""
     rows: list[dict[str, Any]] = []
     buffers: dict[int, int] = {}
     too_slow: tuple[int, int] | None = None
     for count, side in points() if grid is None else grid:
-        common = {"workload": name, "backend": backend, "splats": count, "width": side}
-        common |= {"height": side, "pass": "fit step"}
+        common = size_row(name, backend, count, side, side) | {"pass": "fit step"}
         if too_slow is not None and count >= too_slow[0] and side >= too_slow[1]:
-            rows.append(
-                {
-                    **common,
-                    "not_run": f"{too_slow[0]} splats at {too_slow[1]} x {too_slow[1]} took more "
-                    f"than {STEP_SECONDS:g} s a step already",
-                }
+            reason = (
+                f"{too_slow[0]} splats at {too_slow[1]} x {too_slow[1]} took more than "
+                f"{STEP_SECONDS:g} s a step already"
             )
+            rows.append({**common, "not_run": reason})
             continue
         try:
-            row = measure_apart(seed, count, side, backend, seconds) | {"workload": name}
+            row = in_a_process(measure, seed, count, side, backend, seconds) | {"workload": name}
             if "peak_bytes" in row:
                 if side not in buffers:
-                    buffers[side] = measure_apart(seed, EMPTY, side, backend, 0.0)["peak_bytes"]
+                    empty = in_a_process(measure, seed, EMPTY, side, backend, 0.0)
+                    buffers[side] = empty["peak_bytes"]
                 row |= {
                     "image_bytes": buffers[side],
                     "bytes_per_splat": max(0, row["peak_bytes"] - buffers[side]) / count,
-                    "contract_bytes_per_splat": contract_bytes(count) / count,
+                    # 2 x parameters + gradients + optimizer state.
+                    "contract_bytes_per_splat": 5 * parameter_bytes(1),
                 }
-        except IgsrError as error:
-            rows.append({**common, "not_run": str(error)})
+        except (IgsrError, RuntimeError) as error:  # the GPU raises RuntimeError
+            rows.append({**common, "not_run": f"the fit failed: {error}"})
             continue
         rows.append(row)
         if row["ms"] > 1e3 * STEP_SECONDS:
@@ -168,9 +133,5 @@ def growth_rows(
 
 
 def pair_rows(backend: str, seed: int, seconds: float, pair: tuple[int, int] = PAIR) -> Any:
-    """A step of the built-in fit beside one of the loop of one's own, on W4's scene."""
+    """A step of the built-in fit and one of the custom loop, on W4's scene."""
     return step_rows("W4", [shot_of(seed, *pair)], backend, seconds)
-
-
-if __name__ == "__main__":
-    print(json.dumps(measure(*json.loads(sys.argv[1])), allow_nan=False))

@@ -1,9 +1,9 @@
 """Compare igsr with gsplat's stored picture and gradients of a four-splat scene.
 
-The fixture (Brush's ``tiny_case_with_grads.safetensors``) holds splats, the picture that gsplat
-rendered of them and the gradients that it gave for the stored upstream gradient. gsplat detached
-the view directions of the spherical harmonics when it was made, so the means' gradients are
-compared with that term off: colours are evaluated first and passed in as they are.
+The fixture (Brush's ``tiny_case_with_grads.safetensors``) has splats, gsplat's picture of them, and
+gsplat's gradients for the stored upstream gradient. That version of gsplat detached the view
+directions of the spherical harmonics, so the means' gradients are compared without that term:
+colors are evaluated first and passed as RGB.
 
     python -m igsr_lab.bench.gsplat_fixture FIXTURE [--backend reference|cpu|gpu]
 """
@@ -48,10 +48,7 @@ def main() -> None:
     }
     shape = [array(name) for name in ("means", "quats", "scales", "opacities")]
     projected = _core.project(*shape, array("coeffs"), sh_degree=3, **camera)
-    picture = {
-        "background": np.zeros(3, dtype),
-        "backend": arguments.backend,
-    }
+    picture = {"background": np.zeros(3, dtype), "backend": arguments.backend}
     image = _core.rasterize(projected, width=WIDTH, height=HEIGHT, **picture)
     out = np.concatenate([image["color"], image["alpha"][..., None]], axis=2)
     difference = np.abs(out - fixture["out_img"])

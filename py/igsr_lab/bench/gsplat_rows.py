@@ -1,4 +1,4 @@
-"""gsplat's CUDA kernels on the scenes that igsr's are timed on, where CUDA and gsplat are."""
+"""Rows of gsplat's CUDA kernels on igsr's scenes, if CUDA and gsplat are available."""
 
 from __future__ import annotations
 
@@ -12,16 +12,15 @@ import torch
 
 from igsr import _core
 from igsr.errors import IgsrError
-from igsr_lab.bench.comparison import BOUND_3D, errors_row
+from igsr_lab.bench.comparison import BOUND_3D, errors_row, size_row
 from igsr_lab.bench.scenes import Arrays, Scene
-from igsr_lab.bench.stage_rows import beside_reference
-from igsr_lab.bench.timed_work import repeated
+from igsr_lab.bench.stage_rows import compare_picture, repeated
 
 NAME = "gsplat"
 
 
 def why_not() -> str | None:
-    """Why gsplat's kernels cannot be timed here; None where they can."""
+    """The reason that gsplat cannot be timed here, or None."""
     if not torch.cuda.is_available():
         return "PyTorch finds no CUDA device"
     if importlib.util.find_spec("gsplat") is None:
@@ -32,21 +31,8 @@ def why_not() -> str | None:
 def gsplat_rows(
     workload: str, scene: Scene, v_image: Arrays, seconds: float, device: str = "cuda"
 ) -> list[dict[str, Any]]:
-    """Forward and backward of gsplat's ``rasterization``: times, and errors as igsr's own have.
-
-    Times are between two synchronizations.
-
-    Args:
-        workload: its name.
-        scene: what is drawn, with raw parameters.
-        v_image: "v_color" [H, W, 3] and "v_alpha" [H, W].
-        seconds: how long it is repeated.
-        device: of torch.
-
-    Raises:
-        IgsrError: gsplat fails.
-    """
-    # Not imported by name: where it is not installed, there is nothing to check types against.
+    """Times and errors of gsplat's ``rasterization``, forward and backward."""
+    # Not a static import, which type checkers could not resolve if it is not installed.
     gsplat = importlib.import_module(NAME)
 
     def tensor(array: Any) -> torch.Tensor:
@@ -65,16 +51,20 @@ def gsplat_rows(
         "height": scene.height,
         "sh_degree": scene.sh_degree,
         "backgrounds": tensor(scene.background)[None],
-        # gsplat 1.5.3 refuses backgrounds where it packs what is in sight.
+        # gsplat 1.5.3 does not support backgrounds with packing.
         "packed": False,
     }
 
-    def done() -> float:
+    def synchronized() -> float:
         if device == "cuda":
             torch.cuda.synchronize()
         return time.perf_counter()
 
-    def drawn() -> tuple[torch.Tensor, torch.Tensor]:
+    def clear_gradients() -> None:
+        for value in parameters.values():
+            value.grad = None
+
+    def rendered() -> tuple[torch.Tensor, torch.Tensor]:
         given = dict(parameters)
         if scene.raw_parameters:
             given["scales"] = given["scales"].exp()
@@ -86,36 +76,34 @@ def gsplat_rows(
         return [tensor(v_image["v_color"])[None], tensor(v_image["v_alpha"])[None, ..., None]]
 
     def once(repeats: int) -> dict[str, Any]:
-        for one in parameters.values():
-            one.grad = None
-        began = done()
-        picture = drawn()
-        ended = done()
+        clear_gradients()
+        began = synchronized()
+        picture = rendered()
+        ended = synchronized()
         torch.autograd.backward(picture, v_given)
         return {
             "forward": np.array([1e3 * (ended - began)]),
-            "backward": np.array([1e3 * (done() - ended)]),
+            "backward": np.array([1e3 * (synchronized() - ended)]),
         }
 
     v_given = on_device(v_image)
 
     def gradients(counted: Arrays) -> Arrays:
-        for one in parameters.values():
-            one.grad = None
+        clear_gradients()
         torch.autograd.backward(picture, on_device(counted))
-        return {f"v_{name}": array(one.grad) for name, one in parameters.items()}
+        return {f"v_{name}": array(value.grad) for name, value in parameters.items()}
 
     try:
         times = repeated(once, seconds)
-        picture = drawn()
+        picture = rendered()
         alpha = array(picture[1])[0, ..., 0]
         got = {"color": array(picture[0])[0], "alpha": alpha, "transmittance": 1.0 - alpha}
         own = scene.arrays(_core.working_dtype("cpu"))
         in_sight = _core.project(*own, **scene.options(), backend="cpu")
-        # Depth is a picture of its own there, and has no part in this loss.
-        v_drawn = {**v_image, "v_depth": np.zeros_like(v_image["v_depth"])}
-        compared, _ = beside_reference(scene, in_sight, got, gradients, BOUND_3D["gpu"], v_drawn)
-    except Exception as error:  # whatever another library raises, the report goes on
+        # gsplat does not render depth with color.
+        v_colors = {**v_image, "v_depth": np.zeros_like(v_image["v_depth"])}
+        compared, _ = compare_picture(scene, in_sight, got, gradients, BOUND_3D["gpu"], v_colors)
+    except Exception as error:  # of any kind; the report continues
         raise IgsrError(f"gsplat {getattr(gsplat, '__version__', '')} failed: {error}") from error
     errors = {
         "forward": errors_row("picture", compared.picture, compared.band),
@@ -123,12 +111,8 @@ def gsplat_rows(
     }
     return [
         {
-            "workload": workload,
-            "backend": NAME,
+            **size_row(workload, NAME, len(scene.splats["means"]), scene.width, scene.height),
             "pass": name,
-            "splats": len(scene.splats["means"]),
-            "width": scene.width,
-            "height": scene.height,
             "ms": float(ms.min()),
             "ms_median": float(np.median(ms)),
             "repeats": len(ms),

@@ -1,9 +1,8 @@
-"""The f64 reference, made fast enough to judge whole workloads, without changing its results.
+"""The f64 reference, made fast enough for whole workloads without changing its results.
 
-The reference walks all splats at every pixel. Here the picture is cut into crops, and each crop is
-given only the splats whose box meets it: beyond its ``radii`` a splat is under the alpha threshold
-and contributes nothing, so leaving it out changes no sum (but for the order of the f64 additions of
-gradients over crops). Crops run on all cores.
+The reference visits all splats at every pixel. Here the picture is divided into crops, and each
+crop gets only the splats whose box overlaps it: outside its ``radii``, a splat is below the alpha
+threshold. Only the order of the f64 additions of gradients differs. Crops run on all cores.
 """
 
 from __future__ import annotations
@@ -20,13 +19,13 @@ import numpy.typing as npt
 from igsr import _core
 from igsr_lab.bench.scenes import Arrays, Scene
 
-#: Side of a crop in pixels: small, since its pixels walk all of its splats.
-CROP = 16
+#: Side of a crop: small, since each of its pixels visits all of its splats.
+CROP_PX = 16
 
 Float64 = npt.NDArray[np.float64]
 
-#: What a pair of alphas may differ by, relative to the threshold, where implementations are given
-#: the same 2D splats, and where they project for themselves (docs/how-it-works/numerics.md).
+#: Maximum difference of two alphas, relative to the threshold, if implementations get the same 2D
+#: splats, and if each projects splats (docs/how-it-works/numerics.md).
 ALPHA_BAND_2D = 1e-4
 ALPHA_BAND_3D = 2e-2
 
@@ -47,18 +46,18 @@ class Crop:
 
 
 def crops(projected: Arrays, width: int, height: int) -> list[Crop]:
-    """The whole picture in crops, with the visible splats that may touch each."""
+    """Divide the picture into crops, each with the visible splats that may touch it."""
     means2d, radii = projected["means2d"], projected["radii"]
-    # A pixel of margin against the rounding of f32 radii.
+    # One pixel of margin for the rounding of f32 radii.
     low, high = means2d - radii - 1.0, means2d + radii + 1.0
     visible = (radii > 0).all(axis=1)
     result = []
-    for top in range(0, height, CROP):
-        rows = np.flatnonzero(visible & (high[:, 1] >= top) & (low[:, 1] <= top + CROP))
+    for top in range(0, height, CROP_PX):
+        rows = np.flatnonzero(visible & (high[:, 1] >= top) & (low[:, 1] <= top + CROP_PX))
         row_low, row_high = low[rows, 0], high[rows, 0]
-        for left in range(0, width, CROP):
-            ids = rows[(row_high >= left) & (row_low <= left + CROP)]
-            size = (min(CROP, width - left), min(CROP, height - top))
+        for left in range(0, width, CROP_PX):
+            ids = rows[(row_high >= left) & (row_low <= left + CROP_PX)]
+            size = (min(CROP_PX, width - left), min(CROP_PX, height - top))
             result.append(Crop(left, top, *size, ids))
     return result
 
@@ -77,7 +76,7 @@ def _on_all_cores(work: Callable[[Crop], Any], items: Iterable[Crop]) -> list[An
 def picture(
     projected: Arrays, chosen: list[Crop], shape: tuple[int, int], background: Any
 ) -> Arrays:
-    """The f64 color, alpha, depth and transmittance of ``projected``; NaN outside the crops."""
+    """Color, alpha, depth and transmittance in f64; NaN outside the crops."""
     height, width = shape
     background = np.asarray(background, dtype=np.float64)
 
@@ -103,7 +102,7 @@ def picture(
 def gradients2d(
     projected: Arrays, chosen: list[Crop], image: Arrays, v_image: Arrays, background: Any
 ) -> Arrays:
-    """The f64 gradients of the 2D splats; what lies outside the crops has no part in them."""
+    """Gradients of the 2D splats in f64; pixels outside the crops do not count."""
     background = np.asarray(background, dtype=np.float64)
 
     def work(crop: Crop) -> Arrays:
@@ -133,7 +132,7 @@ def gradients2d(
 
 
 def band(projected: Arrays, chosen: list[Crop], shape: tuple[int, int], alpha_band: float) -> Any:
-    """bool [H, W]: pixels at which an f32 implementation may rightly differ."""
+    """Pixels at which an f32 implementation may differ, bool [H, W]."""
 
     def work(crop: Crop) -> npt.NDArray[np.uint8]:
         return _core.band_pixels(
@@ -148,21 +147,15 @@ def band(projected: Arrays, chosen: list[Crop], shape: tuple[int, int], alpha_ba
 
 @dataclass(frozen=True)
 class PairCounts:
-    """How much work a set of 2D splats is.
+    """Amount of work of a set of 2D splats."""
 
-    Attributes:
-        tiles: (splat, 16x16 tile) pairs with at least one pixel at or above the alpha threshold.
-        pixels: (splat, pixel) pairs at or above it.
-        blended: those of them that come before their pixel stops.
-    """
-
-    tiles: int
-    pixels: int
-    blended: int
+    tiles: int  # (splat, 16x16 tile) pairs with at least one pixel at or above the alpha threshold
+    pixels: int  # (splat, pixel) pairs at or above the threshold
+    blended: int  # pairs of ``pixels`` that come before their pixel is opaque
 
 
 def pair_counts(projected: Arrays, width: int, height: int) -> PairCounts:
-    """Count pairs in f64, without the renderer."""
+    """Count pairs in f64 by numpy."""
     order = np.argsort(projected["depths"].astype(np.float32), kind="stable")
     rank = np.empty(len(order), dtype=np.intp)
     rank[order] = np.arange(len(order))
@@ -188,10 +181,10 @@ def pair_counts(projected: Arrays, width: int, height: int) -> PairCounts:
 
 
 def project(scene: Scene, order_of: Arrays) -> Arrays:
-    """The scene's 2D splats in f64, with the depths of the backend's own f32 ``order_of``.
+    """Project a scene in f64, with the depths that the backend computed in f32.
 
-    Splats at equal depth up to rounding have no right order, and to swap two opaque ones changes
-    pictures and gradients by much: the reference takes the backend's order, and nothing else.
+    The order of splats at equal depth up to rounding is arbitrary but changes pictures, so the
+    reference takes the backend's.
     """
     exact = _core.project(*scene.arrays(np.float64), **scene.options(), backend="reference")
     seen = (order_of["radii"] > 0).all(axis=1) & (exact["radii"] > 0).all(axis=1)
@@ -200,7 +193,7 @@ def project(scene: Scene, order_of: Arrays) -> Arrays:
 
 
 def gradients3d(scene: Scene, projected: Arrays, v_projected: Arrays) -> Arrays:
-    """The f64 gradients of splats and camera."""
+    """Gradients of splats and camera in f64."""
     return _core.project_backward(
         *scene.arrays(np.float64),
         projected,

@@ -1,47 +1,36 @@
-"""Time against error, and growth, as pictures."""
+"""Plots of time against error, and of growth."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
-from igsr._internal.atomic_write import atomic_write
 from igsr_lab.bench.growth import GROWN_COUNT, GROWN_SIDE
 from igsr_lab.bench.table import machine_line
+from igsr_lab.report_parts import new_figure, save_figure
 
-#: Colours that stay apart in print and for the colour-blind (Okabe and Ito).
+#: Colors that are distinct in print and for the color-blind (Okabe and Ito).
 COLORS = {"cpu": "#0072b2", "gpu": "#d55e00", "reference": "#444444"}
 MARKERS = "os^Dv*XP<>"
-#: What is exactly right has no place on a logarithmic axis; it is drawn at this error.
-LEAST_ERROR = 1e-16
+#: Errors of zero are drawn at this error on logarithmic axes.
+MIN_ERROR = 1e-16
 
 
 def plot_speed_vs_error(path: Path, report: dict[str, Any]) -> None:
-    """Write a PNG of (time, largest error) of each row, and of W4's growth where there is any.
-
-    Args:
-        path: of the PNG.
-        report: of ``run_benchmark`` or ``measure_accuracy``.
-
-    Raises:
-        IgsrError: the file cannot be written.
-    """
-    from matplotlib.figure import Figure
-
+    """Plot time and largest error of each row of a report, and W4's growth."""
     measured = [row for row in report["rows"] if row["ms"] is not None]
     grown = [row for row in measured if _is_of_growth(row)]
     points = [row for row in measured if not _is_of_growth(row)]
     lines = (1 if points or not grown else 0) + (1 if grown else 0)
     columns = 4 if any("setting" in row for row in points) else 3
-    figure = Figure(figsize=(4.4 * columns, 4.4 * lines), layout="constrained")
+    figure = new_figure(4.4 * columns, 4.4 * lines)
     figure.suptitle(machine_line(report["machine"]), fontsize=8, wrap=True)
     axes = figure.subplots(lines, columns, squeeze=False)
     if points or not grown:
         _draw_points(axes[0], points)
     if grown:
         _draw_growth(axes[-1], grown)
-    with atomic_write(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=110)
+    save_figure(figure, path, dpi=110)
 
 
 def _is_of_growth(row: dict[str, Any]) -> bool:
@@ -59,19 +48,19 @@ def _label(row: dict[str, Any]) -> str:
 
 
 def _draw_points(axes: Any, rows: list[dict[str, Any]]) -> None:
-    """Pictures, gradients, what settings leave out where there are any, and the legend."""
+    """Errors of pictures, of gradients and of settings, and the legend."""
     from matplotlib.lines import Line2D
 
     labels = list(dict.fromkeys(_label(row) for row in rows))
     marker_of = {label: MARKERS[k % len(MARKERS)] for k, label in enumerate(labels)}
     panels = [
         ("picture", "max_error", "picture", "largest error against the f64 reference"),
-        ("gradients", "max_error", "gradients", "largest error, in parts of the largest gradient"),
+        ("gradients", "max_error", "gradients", "largest error, relative to the largest gradient"),
         (
             "picture",
             "setting_mean_error",
             "the setting: lower SH degrees against the highest,\nboth modes against many samples",
-            "mean error of what it leaves out",
+            "mean error of the setting",
         ),
     ]
     for axis, (kind, error, title, label) in zip(axes[:-1], panels, strict=False):
@@ -79,7 +68,7 @@ def _draw_points(axes: Any, rows: list[dict[str, Any]]) -> None:
             if row["error_of"] == kind:
                 axis.plot(
                     row["ms"],
-                    max(row[error], LEAST_ERROR),
+                    max(row[error], MIN_ERROR),
                     marker_of[_label(row)],
                     color=COLORS[row["backend"]],
                     markersize=7,
@@ -107,7 +96,7 @@ def _draw_points(axes: Any, rows: list[dict[str, Any]]) -> None:
 
 
 def _draw_growth(axes: Any, rows: list[dict[str, Any]]) -> None:
-    """Time over splats, time over pixels, memory over splats where it could be told."""
+    """Time over splats, time over pixels, memory over splats."""
     by_count = [row for row in rows if row["width"] == GROWN_SIDE]
     by_side = [row for row in rows if row["splats"] == GROWN_COUNT]
     with_memory = [row for row in by_count if "bytes_per_splat" in row]
@@ -143,14 +132,14 @@ def _draw_growth(axes: Any, rows: list[dict[str, Any]]) -> None:
                 color="#444444",
                 linestyle="--",
                 linewidth=1,
-                label="2 × parameters + gradients + optimiser state",
+                label="2 × parameters + gradients + optimizer state",
             )
             axis.set_ylim(bottom=0.0)
             axis.legend(fontsize=8, loc="lower left")
 
 
 def _plain_numbers(axis: Any) -> None:
-    """Powers of ten along a logarithmic axis, written out, with 2 and 5 times them if few."""
+    """Label a logarithmic axis with decimal numbers."""
     from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
     low, high = axis.get_view_interval()

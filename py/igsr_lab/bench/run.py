@@ -1,4 +1,4 @@
-"""The benchmark: which workloads run on which backends, and what did not run."""
+"""``run_benchmark``: the workloads on the backends."""
 
 from __future__ import annotations
 
@@ -13,61 +13,45 @@ from igsr.capture import Capture, load_capture
 from igsr.errors import IgsrError
 from igsr_lab.bench.fit_rows import capture_rows, model_path
 from igsr_lab.bench.growth import PAIR, POINT_SECONDS, SMALL_POINTS, growth_rows, pair_rows
-from igsr_lab.bench.machine import describe_machine
 from igsr_lab.bench.scenes import garden
 from igsr_lab.bench.stage_rows import SECONDS, pipeline_rows, rasterize_rows
+from igsr_lab.bench.table import describe_machine
 
 Row = dict[str, Any]
-#: A workload's name, its number of splats where it runs with several, and what gives its rows.
+#: A workload's name, its number of splats if it runs with several, and the function of its rows.
 Work = tuple[str, int | None, Callable[[], list[Row]]]
 
 WORKLOADS = ("W1", "W2", "W3", "W4")
 #: Splats of W3's two models.
 MODEL_COUNTS = (20_000, 100_000)
-#: What W4 is called where it is cut down to what a software driver does in minutes.
+#: Name of W4 with few points, for software drivers.
 SMALL = "W4 small"
 DOES_NOT_FIT = "the reference does not fit"
-#: What every row has, whether it ran or not.
-COLUMNS: dict[str, Any] = {
-    "workload": None,
-    "backend": None,
-    "pass": None,
-    "splats": None,
-    "width": None,
-    "height": None,
-    "ms": None,
-    "max_error": None,
-    "mean_error": None,
-}
+#: Keys of every row, also of workloads that did not run.
+COLUMNS: dict[str, Any] = dict.fromkeys(
+    (
+        *("workload", "backend", "pass", "splats", "width", "height"),
+        *("ms", "max_error", "mean_error"),
+    )
+)
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What to run.
+    """What to run."""
 
-    Attributes:
-        backends: resolved names.
-        workloads: some of ``WORKLOADS``.
-        garden: gsplat's ``test_garden.npz``, for W2.
-        capture: photos for W3.
-        models: folder that keeps W3's fitted models.
-        seed: of all that is drawn.
-        seconds: how long a row is repeated.
-        small: a few small points in place of W4, by the name of ``SMALL``.
-    """
-
-    backends: tuple[str, ...]
-    workloads: tuple[str, ...] = WORKLOADS
-    garden: Path | None = None
-    capture: Path | None = None
-    models: Path = Path("out/bench")
-    seed: int = 0
-    seconds: float = SECONDS
-    small: bool = False
+    backends: tuple[str, ...]  # resolved names
+    workloads: tuple[str, ...] = WORKLOADS  # some of ``WORKLOADS``
+    garden: Path | None = None  # gsplat's ``test_garden.npz``, for W2
+    capture: Path | None = None  # photos for W3
+    models: Path = Path("out/bench")  # folder of W3's fitted models
+    seed: int = 0  # random seed of the workloads
+    seconds: float = SECONDS  # time that each row is repeated
+    small: bool = False  # whether W4 has a few small points only
 
 
 def not_run(workload: str, backend: str, reason: str, splats: int | None = None) -> Row:
-    """A row that says why a workload has no figures."""
+    """A row of a workload that did not run, with the reason."""
     row = {"workload": workload, "backend": backend, "splats": splats, "not_run": reason}
     return {**COLUMNS, **row}
 
@@ -75,18 +59,11 @@ def not_run(workload: str, backend: str, reason: str, splats: int | None = None)
 def run_benchmark(
     settings: Settings, on_row: Callable[[str], object] = lambda doing: None
 ) -> dict[str, Any]:
-    """Run the workloads; ``{"machine": ..., "rows": [...]}``.
+    """Run the workloads; return ``{"machine": ..., "rows": [...]}``.
 
-    A workload that fails has a row that says why, and the others' rows are kept.
-
-    Args:
-        settings: what to run.
-        on_row: told what is about to run.
-
-    Raises:
-        IgsrError: a file that was given cannot be used.
+    A workload that fails has a row with the reason. ``on_row`` gets a description of each.
     """
-    # A mistake in a path is found before the first minute of work.
+    # Check files before the first minute of work.
     scene = None if settings.garden is None else garden(settings.garden, settings.seed)
     capture = None if settings.capture is None else load_capture(settings.capture)
     if capture is not None and "W3" in settings.workloads:
@@ -99,19 +76,24 @@ def run_benchmark(
     for backend in settings.backends:
         for workload, splats, work in _work(settings, backend, scene, capture):
             on_row(f"{workload} on {backend}" + (f" with {splats} splats" if splats else ""))
-            try:
-                found = work()
-            except (IgsrError, RuntimeError) as error:  # the renderer's RuntimeErrors are the GPU's
-                # What was measured before, perhaps for minutes, is not thrown away.
-                found = [not_run(workload, backend, str(error), splats)]
-            rows.extend({**COLUMNS, **row} for row in found)
+            rows += rows_or_reason(workload, backend, work, splats)
     peaks = [row["peak_gflops"] for row in rows if row.get("peak_gflops")]
     machine["peak_gflops"] = max([machine["peak_gflops"], *peaks])
     return {"machine": machine, "rows": rows}
 
 
+def rows_or_reason(
+    workload: str, backend: str, work: Callable[[], list[Row]], splats: int | None = None
+) -> list[Row]:
+    """Rows of a workload; a single row with the reason if it fails."""
+    try:
+        rows = work()
+    except (IgsrError, RuntimeError) as error:  # the GPU raises RuntimeError
+        rows = [not_run(workload, backend, str(error), splats)]
+    return [{**COLUMNS, **row} for row in rows]
+
+
 def _work(settings: Settings, backend: str, scene: Any, capture: Capture | None) -> Iterator[Work]:
-    """What is to run on one backend, named."""
     seed, seconds = settings.seed, settings.seconds
     if "W1" in settings.workloads:
         yield "W1", None, lambda: rasterize_rows(backend, seed, seconds)
@@ -125,16 +107,18 @@ def _work(settings: Settings, backend: str, scene: Any, capture: Capture | None)
         for count in MODEL_COUNTS:
             yield "W3", count, _capture_work(settings, backend, capture, count)
     if "W4" in settings.workloads:
+        point_seconds = min(seconds, POINT_SECONDS)
         if backend == "reference":
             yield "W4", None, lambda: [not_run("W4", backend, DOES_NOT_FIT)]
+        elif settings.small:
+            yield (
+                SMALL,
+                None,
+                lambda: growth_rows(backend, seed, SMALL_POINTS, point_seconds, SMALL),
+            )
         else:
-            of_a_point = min(seconds, POINT_SECONDS)
-            if settings.small:
-                few = SMALL_POINTS
-                yield SMALL, None, lambda: growth_rows(backend, seed, few, of_a_point, SMALL)
-            else:
-                yield "W4", None, lambda: growth_rows(backend, seed, seconds=of_a_point)
-                yield "W4", PAIR[0], lambda: pair_rows(backend, seed, seconds)
+            yield "W4", None, lambda: growth_rows(backend, seed, seconds=point_seconds)
+            yield "W4", PAIR[0], lambda: pair_rows(backend, seed, seconds)
 
 
 def _capture_work(
@@ -150,9 +134,5 @@ def _capture_work(
 
 
 def resolved_backends(names: list[str]) -> tuple[str, ...]:
-    """Backends by the names that run, each once.
-
-    Args:
-        names: "auto", "cpu", "gpu" or "reference", in any number.
-    """
+    """Resolve backends and remove repeated ones."""
     return tuple(dict.fromkeys(_core.resolve_backend(name) for name in names))

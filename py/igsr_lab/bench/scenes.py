@@ -1,7 +1,6 @@
-"""What the workloads draw: 2D splats (W1), the garden (W2), scenes of any size (W4, accuracy).
+"""Scenes of the workloads: 2D splats (W1), the garden (W2), balls of any size (W4, accuracy).
 
-Everything is drawn with numpy's PCG64 from the workload's seed, so the same seed gives the same
-bits on every machine.
+Random numbers are numpy's PCG64, so a seed gives the same bits on every machine.
 """
 
 from __future__ import annotations
@@ -20,45 +19,34 @@ from igsr.errors import IgsrError
 #: Arrays by name, as ``_core`` takes and returns them.
 Arrays = dict[str, Any]
 
-#: A scene's arrays in the renderer's order.
+#: Arrays of a scene in the renderer's order.
 PARAMETERS = ("means", "quats", "scales", "opacities", "colors")
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Splats in front of one camera.
+    """Splats in front of one camera."""
 
-    Attributes:
-        splats: means [N, 3], quats [N, 4], scales [N, 3], opacities [N], colors [N, 3] or
-            [N, K, 3], float32.
-        sh_degree: degree of ``colors``, or None where they are colours themselves.
-        raw_parameters: whether scales are logarithms and opacities logits.
-        viewmat: [4, 4] world-to-camera.
-        intrinsics: [4] fx, fy, cx, cy.
-        width, height: picture size in pixels.
-        background: [3] RGB.
-        antialiased: whether opacities make up for the blur.
-    """
-
+    #: means [N, 3], quats [N, 4], scales [N, 3], opacities [N], colors [N, 3] or [N, K, 3], float32
     splats: Arrays
-    sh_degree: int | None
-    raw_parameters: bool
-    viewmat: npt.NDArray[np.float64]
-    intrinsics: npt.NDArray[np.float64]
-    width: int
+    sh_degree: int | None  # degree of ``colors``, or None if they are RGB
+    raw_parameters: bool  # whether scales are logarithms and opacities logits
+    viewmat: npt.NDArray[np.float64]  # [4, 4] world-to-camera
+    intrinsics: npt.NDArray[np.float64]  # [4] fx, fy, cx, cy
+    width: int  # picture size in pixels
     height: int
-    background: npt.NDArray[np.float32]
-    antialiased: bool = False
+    background: npt.NDArray[np.float32]  # [3] RGB
+    antialiased: bool = False  # whether opacities are reduced by the blur
 
     def arrays(self, dtype: Any) -> tuple[Any, Any, Any, Any, Any]:
-        """The parameter arrays in the order and dtype in which ``_core`` takes them."""
+        """The parameters as arguments of ``_core.project``."""
         means, quats, scales, opacities, colors = (
             np.ascontiguousarray(self.splats[name], dtype=dtype) for name in PARAMETERS
         )
         return means, quats, scales, opacities, colors
 
     def options(self) -> dict[str, Any]:
-        """What ``_core.project`` takes by name, the backend left out."""
+        """Keywords of ``_core.project``, except the backend."""
         return {
             "sh_degree": self.sh_degree,
             "raw_parameters": self.raw_parameters,
@@ -73,13 +61,11 @@ class Scene:
         }
 
 
-def splats2d(
-    seed: int, count: int = 20_000, width: int = 400, height: int = 400
-) -> dict[str, npt.NDArray[np.float32]]:
-    """W1: 2D splats uniform over the picture, as ``_core.project`` would return them.
+def splats2d(seed: int, count: int = 20_000, width: int = 400, height: int = 400) -> Arrays:
+    """W1: 2D splats, uniform over the picture, in the format of ``_core.project``.
 
     sigma = exp(N(ln 3, 0.6)) px per axis at a uniform angle, 0.3 px^2 of blur, opacity U(0.1, 0.9),
-    colours U(0, 1), depths U(1, 10).
+    colors U(0, 1), depths U(1, 10).
     """
     random = np.random.default_rng(seed)
     means2d = random.uniform((0.0, 0.0), (width, height), (count, 2))
@@ -94,14 +80,8 @@ def splats2d(
     yy = sine**2 * variance[:, 0] + cosine**2 * variance[:, 1] + _core.EPS2D
     xy = cosine * sine * (variance[:, 0] - variance[:, 1])
     determinant = xx * yy - xy * xy
-    factors = np.stack(
-        [
-            np.sqrt(yy / determinant),
-            -xy / np.sqrt(yy * determinant),
-            1.0 / np.sqrt(yy),
-        ],
-        axis=1,
-    )
+    columns = np.sqrt(yy / determinant), -xy / np.sqrt(yy * determinant), 1.0 / np.sqrt(yy)
+    factors = np.stack(columns, axis=1)
     reach = 2.0 * np.log(opacities / _core.ALPHA_MIN)
     radii = np.sqrt(reach[:, None] * np.stack([xx, yy], axis=1))
     arrays = {
@@ -112,20 +92,16 @@ def splats2d(
         "opacities": opacities,
         "radii": radii,
     }
-    return {name: np.ascontiguousarray(a, dtype=np.float32) for name, a in arrays.items()}
+    return _float32(arrays)
 
 
 def garden(path: Path, seed: int) -> Scene:
-    """W2: the points of the garden fixture with drawn shapes, in front of its first camera.
+    """W2: the points of gsplat's ``test_garden.npz`` with random shapes, and its first camera.
 
-    Scales U(0, 0.02), opacities U(0, 1), quats N(0, 1); positions, colours and cameras are the
-    file's (gsplat's ``test_garden.npz``).
-
-    Raises:
-        IgsrError: the file cannot be read, is not that fixture, or holds what cannot be drawn.
+    Scales U(0, 0.02), opacities U(0, 1), quats N(0, 1).
     """
     try:
-        # What is too large for float32 becomes infinite, and is refused as such.
+        # Numbers too large for float32 become infinite and are refused below.
         with np.load(path, allow_pickle=False) as file, np.errstate(over="ignore"):
             means = file["means3d"].astype(np.float32)
             colors = file["colors"].astype(np.float32) / np.float32(255.0)
@@ -138,7 +114,7 @@ def garden(path: Path, seed: int) -> Scene:
         if not (np.isfinite(means).all() and np.isfinite(colors).all()):
             raise ValueError("means3d and colors must be finite numbers")
         scene = _scene_of_points(means, colors, viewmat, K, width, height, seed)
-        # The renderer knows what cameras and sizes it can draw.
+        # The renderer checks cameras and sizes.
         drawn = _core.project(*scene.arrays(np.float32), **scene.options(), backend="cpu")
         if not (drawn["radii"] > 0).any():
             raise ValueError("its first camera sees none of its points")
@@ -170,7 +146,7 @@ def _scene_of_points(
         "colors": colors,
     }
     return Scene(
-        splats={name: np.ascontiguousarray(a, dtype=np.float32) for name, a in splats.items()},
+        splats=_float32(splats),
         sh_degree=None,
         raw_parameters=False,
         viewmat=np.ascontiguousarray(viewmat),
@@ -189,11 +165,10 @@ def ball(
     sh_degree: int = 2,
     size: float = 1.0,
 ) -> Scene:
-    """W4 and the accuracy tables: a ball of splats of SH ``sh_degree`` that fills the picture.
+    """W4 and accuracy: a ball of splats that fills the picture.
 
-    A splat's area falls with their number, as where a surface is drawn finer, so that each pixel
-    blends about 20 of them however many there are (a fitted lego of 20 000 splats: 13 to 16).
-    ``size`` scales all splats.
+    A splat's area decreases with their number, so that each pixel always blends about 20 of them (a
+    fitted lego of 20 000 splats: 13 to 16). ``size`` scales all splats.
     """
     random = np.random.default_rng(seed)
     direction = random.normal(size=(count, 3))
@@ -212,10 +187,10 @@ def ball(
     distance = 3.0
     viewmat = np.eye(4)
     viewmat[2, 3] = distance
-    # The ball's outline lies at 1 / sqrt(distance^2 - 1); it reaches the shorter sides.
+    # The ball's outline, at 1 / sqrt(distance^2 - 1), touches the shorter sides.
     focal = 0.5 * min(width, height) * np.sqrt(distance**2 - 1.0)
     return Scene(
-        splats={name: np.ascontiguousarray(a, dtype=np.float32) for name, a in splats.items()},
+        splats=_float32(splats),
         sh_degree=sh_degree,
         raw_parameters=True,
         viewmat=viewmat,
@@ -227,11 +202,15 @@ def ball(
 
 
 def upstream(seed: int, width: int, height: int) -> Arrays:
-    """Gradients N(0, 1) of a picture's colour and alpha, a tenth of it of its depth, float32."""
+    """Upstream gradients, float32: N(0, 1) for color and alpha, a tenth of that for depth."""
     random = np.random.default_rng([seed, width, height])
     arrays = {
         "v_color": random.normal(size=(height, width, 3)),
         "v_alpha": random.normal(size=(height, width)),
         "v_depth": 0.1 * random.normal(size=(height, width)),
     }
-    return {name: a.astype(np.float32) for name, a in arrays.items()}
+    return _float32(arrays)
+
+
+def _float32(arrays: Arrays) -> Arrays:
+    return {name: np.ascontiguousarray(a, dtype=np.float32) for name, a in arrays.items()}

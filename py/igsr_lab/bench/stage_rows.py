@@ -1,4 +1,4 @@
-"""Rows of single stages and of the whole pipeline: W1 and W2, and what the accuracy tables need."""
+"""Rows of single stages (W1) and of the whole pipeline (W2, accuracy)."""
 
 from __future__ import annotations
 
@@ -20,31 +20,33 @@ from igsr_lab.bench.comparison import (
     errors_row,
     gradient_error,
     picture_error,
+    size_row,
 )
 from igsr_lab.bench.scenes import Arrays, Scene, splats2d, upstream
 
-#: A repeat that nothing disturbed is among this many on a shared machine.
+#: On a shared machine, one of this many repeats is undisturbed.
 MIN_REPEATS = 5
+#: Measurements that take longer are repeated twice only.
 LONG_SECONDS = 10.0
-#: How long one row is repeated.
+#: Default time that a row is repeated.
 SECONDS = 2.0
 
 #: Floating-point operations per blended (splat, pixel) pair, a multiply-add as two: offset 6,
-#: exponential 16, alpha and transmittance 3, four channels 8; backward without the channels, and
-#: with the channels' gradients 15, alpha's 6 and the six moments 11. What is spent on pixels that a
-#: splat does not reach is not counted: it is not work that was asked for.
+#: exponential 16, alpha and transmittance 3, four channels 8; backward without the channels, plus
+#: the channels' gradients 15, alpha's 6 and the six moments 11. Pixels that a splat does not reach
+#: are not counted.
 FORWARD_OPERATIONS = 33
 BACKWARD_OPERATIONS = 57
 
-#: Bytes: the largest array after whose end the C library of Linux keeps what is freed.
-KEPT = 32 * 2**20
+#: Largest array whose memory Linux's C library keeps after it is freed.
+KEPT_BYTES = 32 * 2**20
 
 Times = dict[str, npt.NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """One backend's picture and gradients beside the reference's."""
+    """Errors of one backend's picture and gradients."""
 
     picture: Error
     gradients: Error
@@ -52,13 +54,10 @@ class Comparison:
 
 
 def repeated(measure: Callable[[int], Times], seconds: float) -> Times:
-    """``measure(1)`` again and again for about ``seconds``, ``MIN_REPEATS`` times at least.
-
-    What takes longer than ``LONG_SECONDS``, as the reference may, is done twice and no more.
-    """
-    # A process that never freed a large array gives pages back after each call, and takes 1.5 times
-    # as long for W1. Programs that load photos have freed one.
-    np.empty(KEPT - 2**16, np.uint8)
+    """Repeat ``measure(1)`` for some seconds, at least ``MIN_REPEATS`` times (2 if it is slow)."""
+    # A process that never freed a large array returns pages after each call, and takes 1.5 times as
+    # long for W1. Programs that load photos have freed one.
+    np.empty(KEPT_BYTES - 2**16, np.uint8)
     started = time.perf_counter()
     parts = [measure(1)]  # also the warm-up: pipelines compile, pages are touched
     least = MIN_REPEATS if time.perf_counter() - started < LONG_SECONDS else 2
@@ -67,21 +66,16 @@ def repeated(measure: Callable[[int], Times], seconds: float) -> Times:
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def gflops_now() -> float:
-    """The machine's peak of this moment, on the CPU's threads."""
-    return max(_core.peak_multiply_add(0.01) for _ in range(3))
-
-
 def runs_on_cores(backend: str) -> bool:
-    """Whether a backend's kernels run on the cores that the peak is measured on."""
+    """Whether a backend runs on the cores that the peak is measured on."""
     return backend != "gpu" or "llvmpipe" in _core.backend_info(backend)["device"].lower()
 
 
 def timing_row(
     ms: npt.NDArray[np.float64], backend: str, operations: float | None
 ) -> dict[str, Any]:
-    """The time columns of a row. The fraction is of the peak measured right after."""
-    peak = gflops_now()
+    """The time columns of a row; the peak is measured right after it."""
+    peak = max(_core.peak_multiply_add(0.01) for _ in range(3))
     row: dict[str, Any] = {
         "ms": float(ms.min()),
         "ms_median": float(np.median(ms)),
@@ -94,8 +88,8 @@ def timing_row(
     return row
 
 
-def masked(v_image: Arrays, left_out: npt.NDArray[np.bool_], known: npt.NDArray[Any]) -> Arrays:
-    """Upstream gradients without the pixels that do not count or are not compared."""
+def _masked(v_image: Arrays, left_out: npt.NDArray[np.bool_], known: npt.NDArray[Any]) -> Arrays:
+    """Upstream gradients without the pixels that are left out or not compared."""
     keep = ~left_out & np.isfinite(known)
     return {
         name: np.where(keep[..., None] if v.ndim == 3 else keep, v, np.float32(0.0))
@@ -106,11 +100,7 @@ def masked(v_image: Arrays, left_out: npt.NDArray[np.bool_], known: npt.NDArray[
 def w1_comparison(
     backend: str, seed: int, count: int, side: int
 ) -> tuple[Error, Error, Band, Arrays]:
-    """W1's picture and gradients beside the reference's.
-
-    Returns the picture's error, the gradients', the band of pixels that may differ and the
-    upstream gradients that count.
-    """
+    """Errors of W1's picture and gradients, the band, and the upstream gradients that count."""
     projected = splats2d(seed, count, side, side)
     shape = (side, side)
     background = np.zeros(3)
@@ -123,7 +113,7 @@ def w1_comparison(
     options: dict[str, Any] = {"background": background.astype(dtype), "backend": backend}
     got = _core.rasterize(own, width=side, height=side, **options)
     picture, band = picture_error(got, expected, in_band, BOUND_2D[backend])
-    v_image = masked(upstream(seed, side, side), band.left_out, expected["alpha"])
+    v_image = _masked(upstream(seed, side, side), band.left_out, expected["alpha"])
     v_own = {name: v.astype(dtype) for name, v in v_image.items()}
     v_expected = oracle.gradients2d(exact, crops, expected, v_image, background)
     v_got = _core.rasterize_backward(own, got, **v_own, **options, absolute=False)
@@ -133,7 +123,7 @@ def w1_comparison(
 def rasterize_rows(
     backend: str, seed: int, seconds: float = SECONDS, count: int = 20_000, side: int = 400
 ) -> list[dict[str, Any]]:
-    """W1: rasterize and its backward on 2D splats; bin is part of both."""
+    """W1: rasterize and its backward on 2D splats; both include binning."""
     picture, gradients, band, v_own = w1_comparison(backend, seed, count, side)
     projected = splats2d(seed, count, side, side)
     dtype = _core.working_dtype(backend)
@@ -146,37 +136,32 @@ def rasterize_rows(
     exact = {name: array.astype(np.float64) for name, array in projected.items()}
     pairs = oracle.pair_counts(exact, side, side)
     common = {
-        "workload": "W1",
-        "backend": backend,
-        "splats": count,
-        "width": side,
-        "height": side,
+        **size_row("W1", backend, count, side, side),
         "tile_pairs": pairs.tiles,
         "pixel_pairs": pairs.pixels,
         "blended_pairs": pairs.blended,
     }
+    passes = (
+        ("rasterize", FORWARD_OPERATIONS, "picture", picture),
+        ("rasterize_backward", BACKWARD_OPERATIONS, "gradients", gradients),
+    )
     return [
         {
             **common,
-            "pass": "rasterize",
-            **timing_row(times["rasterize"], backend, FORWARD_OPERATIONS * pairs.blended),
-            **errors_row("picture", picture, band),
-        },
-        {
-            **common,
-            "pass": "rasterize_backward",
-            **timing_row(times["rasterize_backward"], backend, BACKWARD_OPERATIONS * pairs.blended),
-            **errors_row("gradients", gradients, band),
-        },
+            "pass": name,
+            **timing_row(times[name], backend, operations * pairs.blended),
+            **errors_row(of, error, band),
+        }
+        for name, operations, of, error in passes
     ]
 
 
 def compare(
     scene: Scene, backend: str, v_image: Arrays, chosen: Callable[[list[Any]], list[Any]] = list
 ) -> tuple[Comparison, Arrays]:
-    """A backend's picture and gradients of a scene beside the reference's; ``chosen`` picks crops.
+    """Compare a backend's picture and gradients of a scene with the reference.
 
-    Returns the comparison and the upstream gradients that count.
+    Returns the comparison, and the upstream gradients that count; ``chosen`` chooses crops.
     """
     dtype = _core.working_dtype(backend)
     parameters = scene.arrays(dtype)
@@ -191,10 +176,10 @@ def compare(
             *parameters, projected, v2d, **scene.options(), backend=backend
         ) | {"v_background": v2d["v_background"]}
 
-    return beside_reference(scene, projected, got, gradients, BOUND_3D[backend], v_image, chosen)
+    return compare_picture(scene, projected, got, gradients, BOUND_3D[backend], v_image, chosen)
 
 
-def beside_reference(
+def compare_picture(
     scene: Scene,
     projected: Arrays,
     got: Arrays,
@@ -203,40 +188,21 @@ def beside_reference(
     v_image: Arrays,
     chosen: Callable[[list[Any]], list[Any]] = list,
 ) -> tuple[Comparison, Arrays]:
-    """Anybody's picture and gradients of a scene beside the reference's.
+    """Compare a picture ``got`` and its gradients with the reference; see ``compare``.
 
-    Args:
-        scene: what was drawn.
-        projected: its splats, projected in f32 by any of igsr's backends: which are in sight.
-        got: "color" [H, W, 3], "alpha" and "transmittance" [H, W].
-        gradients: from upstream gradients to those of ``_core.project_backward``'s names.
-        bound: of pixels that may differ; see ``comparison.BOUND_3D``.
-        v_image: upstream gradients.
-        chosen: picks crops.
-
-    Returns:
-        The comparison and the upstream gradients that count.
+    ``projected`` are the splats, projected in f32 by one of igsr's backends.
     """
     exact = oracle.project(scene, projected)
     crops = chosen(oracle.crops(exact, scene.width, scene.height))
     expected = oracle.picture(exact, crops, (scene.height, scene.width), scene.background)
     in_band = oracle.band(exact, crops, (scene.height, scene.width), oracle.ALPHA_BAND_3D)
     picture, band = picture_error(got, expected, in_band, bound)
-    counted = masked(v_image, band.left_out, expected["alpha"])
+    counted = _masked(v_image, band.left_out, expected["alpha"])
     v2d_expected = oracle.gradients2d(exact, crops, expected, counted, scene.background)
     v_expected = oracle.gradients3d(scene, exact, v2d_expected) | {
         "v_background": v2d_expected["v_background"]
     }
     return Comparison(picture, gradient_error(gradients(counted), v_expected), band), counted
-
-
-def time_scene(scene: Scene, backend: str, v_image: Arrays, seconds: float) -> Times:
-    """Milliseconds of each repeat of the four stages."""
-    dtype = _core.working_dtype(backend)
-    parameters = scene.arrays(dtype)
-    keywords = scene.options() | {name: v.astype(dtype) for name, v in v_image.items()}
-    keywords |= {"background": scene.background.astype(dtype), "backend": backend}
-    return repeated(lambda n: _core.time_pipeline(*parameters, **keywords, repeats=n), seconds)
 
 
 def pipeline_rows(
@@ -245,14 +211,13 @@ def pipeline_rows(
     """Forward and backward of the whole pipeline, from splats to their gradients."""
     v_image = upstream(seed, scene.width, scene.height)
     comparison, v_image = compare(scene, backend, v_image)
-    times = time_scene(scene, backend, v_image, seconds)
-    common = {
-        "workload": workload,
-        "backend": backend,
-        "splats": len(scene.splats["means"]),
-        "width": scene.width,
-        "height": scene.height,
-    }
+    dtype = _core.working_dtype(backend)
+    parameters = scene.arrays(dtype)
+    keywords = scene.options() | {name: v.astype(dtype) for name, v in v_image.items()}
+    keywords |= {"background": scene.background.astype(dtype), "backend": backend}
+    times = repeated(lambda n: _core.time_pipeline(*parameters, **keywords, repeats=n), seconds)
+    count = len(scene.splats["means"])
+    common = size_row(workload, backend, count, scene.width, scene.height)
     passes = (
         ("forward", ("project", "rasterize"), "picture", comparison.picture),
         ("backward", ("rasterize_backward", "project_backward"), "gradients", comparison.gradients),

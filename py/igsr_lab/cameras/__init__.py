@@ -1,1 +1,1 @@
-"""Measurements of pose networks joined with features, by a network whose errors are known."""
+"""Measurements of pose networks combined with features, by a network with known errors."""

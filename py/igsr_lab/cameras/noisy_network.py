@@ -1,5 +1,4 @@
-"""A pose network that tells the truth with known noise: what is made of it, and not the network,
-is measured."""
+"""A stand-in for pose networks: the truth with known noise."""
 
 from __future__ import annotations
 
@@ -13,44 +12,36 @@ from igsr.capture import Camera
 from igsr.capture.photo_folder import Photo
 from igsr.geometry.similarity import Similarity
 from igsr.pose.alignment import AlignedPhoto
-from igsr.pose.da3.prediction import resampling_of
+from igsr.pose.da3.preprocessing import resampling_of
 
 Float64 = npt.NDArray[np.float64]
 
-#: Cells of a depth map, along its longer side, that are wrong together: networks err smoothly.
+#: Cells along the longer side of a depth map whose errors are correlated.
 CELLS = 12
-#: Confidence of pixels that are sure, and of those that are not.
-SURE, UNSURE = 4.0, 1.5
+#: Confidence of confident pixels and of other pixels.
+HIGH_CONFIDENCE, LOW_CONFIDENCE = 4.0, 1.5
 
 
 @dataclass(frozen=True)
 class Noise:
-    """How wrong the network is.
+    """Errors of the network."""
 
-    Attributes:
-        depth: standard deviation of the logarithm of depths, of a photo's scale and of cells in it.
-        rotation: degrees that every camera is turned by, about an axis of its own.
-        center: distance that every camera is moved by, in units of the median depth.
-        focal: standard deviation of the logarithm of focal lengths.
-        wrong_confidence: part of the cells that are sure of a depth that is off by a half.
-    """
-
-    depth: float = 0.02
-    rotation: float = 1.0
-    center: float = 0.02
-    focal: float = 0.02
-    wrong_confidence: float = 0.05
+    depth: float = 0.02  # standard deviation of the logarithm of depths, per photo and per cell
+    rotation: float = 1.0  # rotation of every camera about a random axis, degrees
+    center: float = 0.02  # shift of every camera, in units of the median depth
+    focal: float = 0.02  # standard deviation of the logarithm of focal lengths
+    wrong_confidence: float = 0.05  # fraction of the cells with a wrong depth of high confidence
 
 
 class NoisyNetwork:
-    """Stands where a network stands (``igsr.pose.da3.prediction.Predictor``).
+    """A predictor (``igsr.pose.da3.passes.Predictor``).
 
     Args:
-        cameras: true ones, by photo name.
-        depths: true z-depths [h, w] of whole photos in units of the cameras, NaN where not known.
-        noise: how wrong it is.
-        seed: of the noise, and of the world and unit that a pass has.
-        most: photos of a pass.
+        cameras: true cameras by photo name.
+        depths: true z-depths [h, w] of whole photos, NaN if unknown.
+        noise: the errors.
+        seed: of the noise, and of each pass's world and scale.
+        most: maximum number of photos in a pass.
     """
 
     def __init__(
@@ -61,7 +52,6 @@ class NoisyNetwork:
         seed: int = 0,
         most: int = 32,
     ) -> None:
-        """Keep the truth."""
         self.cameras, self.depths = cameras, depths
         self.noise = Noise() if noise is None else noise
         self.seed, self.most = seed, most
@@ -73,7 +63,7 @@ class NoisyNetwork:
     def __call__(
         self, photos: Sequence[Photo], cameras: Sequence[Camera] | None, seed: int
     ) -> list[AlignedPhoto | None]:
-        """As ``Predictor``; what is known of cameras changes nothing."""
+        """As ``Predictor``; known cameras are ignored."""
         random = np.random.default_rng([self.seed, len(photos)])
         turn = np.linalg.qr(random.normal(size=(3, 3)))[0]
         turn *= np.sign(np.linalg.det(turn))
@@ -100,11 +90,11 @@ class NoisyNetwork:
         log = np.where(wrong, log + 0.5 * random.choice([-1.0, 1.0]), log)
         sure = known & (wrong | (random.uniform(size=depth.shape) > 0.1))
         shown = np.where(known, depth * np.exp(log), 10.0 * middle).astype(np.float32)
-        confidence = np.where(sure, SURE, np.where(known, UNSURE, 1.0)).astype(np.float32)
-        # Surer and less sure pixels, as networks have them.
-        confidence += np.where(known, 0.1 * random.uniform(size=depth.shape), 0.0).astype(
-            np.float32
-        )
+        low = np.where(known, LOW_CONFIDENCE, 1.0)
+        confidence = np.where(sure, HIGH_CONFIDENCE, low).astype(np.float32)
+        # Vary it between pixels, as networks do.
+        variation = np.where(known, 0.1 * random.uniform(size=depth.shape), 0.0)
+        confidence += variation.astype(np.float32)
         return AlignedPhoto(self._moved(camera, middle, random), grid, shown, confidence)
 
     def _moved(self, camera: Camera, middle: float, random: np.random.Generator) -> Camera:
@@ -120,12 +110,12 @@ class NoisyNetwork:
         viewmat[:3, 3] = -viewmat[:3, :3] @ center
         K = camera.K.copy()
         K[[0, 1], [0, 1]] *= np.exp(noise.focal * random.normal())
-        K[:2, 2] = camera.width / 2, camera.height / 2  # networks know no other
+        K[:2, 2] = camera.width / 2, camera.height / 2  # networks assume it
         return replace(camera, viewmat=viewmat, K=K)
 
 
 def _cells(values: npt.NDArray[np.bool_], shape: tuple[int, ...]) -> npt.NDArray[np.bool_]:
-    """Values of cells as those of their pixels."""
+    """Repeat values of cells for their pixels."""
     row, column = (
         np.arange(size) * count // size for size, count in zip(shape, values.shape, strict=True)
     )
@@ -133,7 +123,7 @@ def _cells(values: npt.NDArray[np.bool_], shape: tuple[int, ...]) -> npt.NDArray
 
 
 def _spread(values: Float64, shape: tuple[int, ...]) -> Float64:
-    """Values of cells as smooth values of pixels, linear between the cells' middles."""
+    """Interpolate values of cells linearly for all pixels."""
     for axis, size in enumerate(shape):
         count = values.shape[axis]
         at = np.clip((np.arange(size) + 0.5) * count / size - 0.5, 0.0, count - 1.0)

@@ -1,7 +1,6 @@
-"""``python -m igsr_lab bench-check``: compare this build's speed with that of a commit.
+"""``python -m igsr_lab bench-check``: compare this build's speed with another commit's.
 
-The commit is built in a temporary git worktree. The two builds take turns in one run of ``bench
---compare``.
+The commit is built in a temporary git worktree; ``bench --compare`` then runs both builds in turns.
 """
 
 from __future__ import annotations
@@ -17,12 +16,12 @@ from typing import Annotated
 import typer
 
 ROOT = Path(__file__).resolve().parents[3]
-#: Percent.
-SLOWER = 10
+#: The check fails if a row takes this much longer.
+SLOWER_PERCENT = 10
 
 
 def build_of(commit: str, folder: Path) -> Path:
-    """The compiled module of a commit, built with its own sources."""
+    """Build the compiled module of a commit from its own sources."""
     tree = folder / "tree"
     target = Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target")) / "bench-check"
     subprocess.run(["git", "worktree", "add", "--detach", tree, commit], cwd=ROOT, check=True)
@@ -40,7 +39,7 @@ def build_of(commit: str, folder: Path) -> Path:
         for name in ("lib_core.so", "lib_core.dylib")
         if (target / "release" / name).is_file()
     )
-    # Python loads a module by the end of its name.
+    # Python finds modules by the end of the name.
     return Path(shutil.copy(built, folder / "_core.abi3.so"))
 
 
@@ -49,9 +48,10 @@ def bench_check_command(
         str, typer.Argument(metavar="COMMIT", help="The commit to compare with.")
     ] = "HEAD~1",
 ) -> None:
-    """Compare this build with that of COMMIT; the exit status is 1 if a row takes 10 % longer."""
+    """Compare this build with COMMIT's; the exit status is 1 if a row takes 10 % longer."""
     with tempfile.TemporaryDirectory() as folder:
         old = build_of(commit, Path(folder))
-        words = ["bench", "--backend", "cpu", "--compare", str(old), "--fail-above", str(SLOWER)]
+        words = ["bench", "--backend", "cpu", "--compare", str(old)]
+        words += ["--fail-above", str(SLOWER_PERCENT)]
         done = subprocess.run([sys.executable, "-m", "igsr_lab", *words], check=False)
     raise typer.Exit(done.returncode)

@@ -2,82 +2,100 @@
 
 from __future__ import annotations
 
-import enum
+import dataclasses
+import inspect
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
+from igsr._internal.progress_bar import progress_bar
+from igsr._internal.settings import Setting, settings_of
 from igsr.cli.error_messages import error_messages
-from igsr.cli.settings_options import settings_options
-from igsr.cli.shared import (
-    FitBackendChoice,
-    FitBackendOption,
-    JsonOption,
-    error_console,
-    output_console,
-    print_json,
-    resolved,
-)
+from igsr.cli.options import FitBackendOption, JsonOption, option, resolved
+from igsr.cli.output import error_console, output_console, print_json
 from igsr.denoiser.architecture import Architecture
 from igsr.errors import IgsrError
 from igsr_lab.commands.options import JobsOption, RayOption, TimeLeft
-from igsr_lab.commands.training_bar import training_bar
 from igsr_lab.denoiser.training_settings import Training
 
 
-class RecipeChoice(str, enum.Enum):
-    """How fits are degraded for training pairs."""
+def settings_options(cls: type) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """A decorator that replaces the parameter ``given`` by an option per setting of a class.
 
-    sparse = "sparse"
-    underfit = "underfit"
-    noise = "noise"
-    paper = "paper"
-    scattered = "scattered"
-    leave_one_out = "leave-one-out"
+    The command receives ``given``, a dictionary of the settings that are not None.
+    """
+    settings = settings_of(cls)
+
+    def with_options(command: Callable[..., None]) -> Callable[..., None]:
+        parameters: list[inspect.Parameter] = []
+        for parameter in inspect.signature(command, eval_str=True).parameters.values():
+            if parameter.name == "given":
+                parameters += [_parameter(setting) for setting in settings.values()]
+            else:
+                parameters.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
+
+        def wrapped(**values: Any) -> None:
+            given = {name: values.pop(name) for name in settings}
+            command(**values, given={k: v for k, v in given.items() if v is not None})
+
+        wrapped.__doc__ = command.__doc__
+        wrapped.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        wrapped.__annotations__ = {one.name: one.annotation for one in parameters}
+        return wrapped
+
+    return with_options
 
 
-class BackboneChoice(str, enum.Enum):
-    """Backbone of LPIPS."""
-
-    alex = "alex"
-    vgg = "vgg"
-    squeeze = "squeeze"
+def _parameter(setting: Setting) -> inspect.Parameter:
+    dashed = setting.name.replace("_", "-")
+    name = f"--{dashed}/--no-{dashed}" if setting.kind is bool else f"--{dashed}"
+    kind: Any = Literal[setting.choices] if setting.choices else setting.kind
+    default = None if setting.default is dataclasses.MISSING else setting.default
+    return inspect.Parameter(
+        setting.name,
+        inspect.Parameter.KEYWORD_ONLY,
+        default=default,
+        annotation=Annotated[kind | None, option(name, help=setting.help)],
+    )
 
 
 def pairs_command(
     captures: Annotated[
         list[Path], typer.Argument(metavar="CAPTURES", help="Captures with known cameras.")
     ],
-    out: Annotated[Path, typer.Option("--out", metavar="PAIRS", help="Folder for the pairs.")],
+    out: Annotated[Path, option("--out", metavar="PAIRS", help="Folder for the pairs.")],
     recipes: Annotated[
-        list[RecipeChoice] | None,
-        typer.Option("--recipe", help="Repeat it for several. Default: sparse, underfit, noise."),
+        list[str] | None,
+        option(
+            "--recipe",
+            metavar="NAME",
+            help="sparse, underfit, noise, paper, scattered or leave-one-out; repeatable. "
+            "Default: the first three.",
+        ),
     ] = None,
-    fits: Annotated[int, typer.Option("--fits", help="Fits per capture and recipe.")] = 1,
-    views: Annotated[int, typer.Option("--views", help="Novel views rendered per fit.")] = 8,
+    fits: Annotated[int, option("--fits", help="Fits per capture and recipe.")] = 1,
+    views: Annotated[int, option("--views", help="Novel views rendered per fit.")] = 8,
     steps: Annotated[
-        int | None, typer.Option("--steps", help="Steps of each fit. Default: as igsr fit.")
+        int | None, option("--steps", help="Steps of each fit. Default: as igsr fit.")
     ] = None,
-    all_views: Annotated[
-        bool, typer.Option("--all-views", help="Also use the held-out views.")
-    ] = False,
-    seed: Annotated[
-        int, typer.Option("--seed", help="Pairs are deterministic for a given seed.")
-    ] = 0,
+    all_views: Annotated[bool, option("--all-views", help="Also use the held-out views.")] = False,
+    seed: Annotated[int, option("--seed", help="Random seed.")] = 0,
     jobs: JobsOption = 1,
     ray: RayOption = False,
-    backend: FitBackendOption = FitBackendChoice.auto,
+    backend: FitBackendOption = "auto",
     as_json: JsonOption = False,
 ) -> None:
-    """Make training pairs: degraded fits' renders of novel views beside the true photos.
+    """Make training pairs: renders of novel views of degraded fits, and the true photos.
 
-    Finished fits are kept in --out; the same command goes on from there.
+    Finished fits are kept in --out; the same command continues from there.
     """
-    from igsr_lab.denoiser.pairs import DEFAULT_RECIPES, make_pairs
+    from igsr_lab.denoiser.pair_files import DEFAULT_RECIPES
+    from igsr_lab.denoiser.pairs import make_pairs
 
     with error_messages(
-        lambda: "Interrupted; finished fits are kept, the same command goes on from there."
+        lambda: "Interrupted; finished fits are kept, the same command continues from there."
     ):
         time_left = TimeLeft()
 
@@ -91,7 +109,7 @@ def pairs_command(
         rows = make_pairs(
             captures,
             out,
-            recipes=[choice.value for choice in recipes] if recipes else DEFAULT_RECIPES,
+            recipes=recipes or DEFAULT_RECIPES,
             fits=fits,
             views=views,
             steps=steps,
@@ -112,84 +130,74 @@ def pairs_command(
 @settings_options(Training)
 def train_command(
     pairs: Annotated[
-        Path, typer.Option("--pairs", metavar="PAIRS", help="Folder that `pairs` made.")
+        Path, option("--pairs", metavar="PAIRS", help="Folder of pairs made by `pairs`.")
     ],
     out: Annotated[
-        Path, typer.Option("--out", metavar="DIR", help="Folder for weights, log and checkpoint.")
+        Path, option("--out", metavar="DIR", help="Folder for weights, log and checkpoint.")
     ],
     given: dict[str, Any],
     features: Annotated[
         Path | None,
-        typer.Option(
+        option(
             "--features",
             metavar="FILE",
-            help="SqueezeNet 1.0 arrays (.npz), for a perceptual distance that is not LPIPS.",
+            help="SqueezeNet 1.0 arrays (.npz), for a perceptual distance (not LPIPS).",
         ),
     ] = None,
     lpips: Annotated[
-        BackboneChoice | None,
-        typer.Option("--lpips", help="LPIPS with this backbone, which is downloaded."),
+        Literal["alex", "vgg", "squeeze"] | None,
+        option("--lpips", help="LPIPS with this backbone, which is downloaded."),
     ] = None,
-    # Not --start: torchrun would take it for the beginning of one of its own options.
+    # Not --start, which torchrun would read as the beginning of one of its own options.
     start: Annotated[
         Path | None,
-        typer.Option(
-            "--weights", metavar="FILE", help="Weights to go on from, such as igsr's own."
-        ),
+        option("--weights", metavar="FILE", help="Initial weights, such as igsr's own."),
     ] = None,
     width: Annotated[
-        int, typer.Option("--width", help="Channels at half resolution.")
+        int, option("--width", help="Channels at half resolution.")
     ] = Architecture.width,
     residual: Annotated[
-        bool, typer.Option("--residual/--no-residual", help="Add the output to the render.")
+        bool, option("--residual/--no-residual", help="Add the output to the render.")
     ] = Architecture.residual,
     buffers: Annotated[
-        bool, typer.Option("--buffers/--no-buffers", help="Look at alpha, depth, normals ...")
+        bool, option("--buffers/--no-buffers", help="Use alpha, depth, normals ... as input.")
     ] = Architecture.buffers,
     photos: Annotated[
-        str, typer.Option("--photos", help="concatenated, attention or none.")
+        str, option("--photos", help="concatenated, attention or none.")
     ] = Architecture.photos,
-    device: Annotated[
-        str, typer.Option("--device", help="Where to train, as torch names it: cpu, cuda ...")
-    ] = "cpu",
+    device: Annotated[str, option("--device", help="torch device: cpu, cuda ...")] = "cpu",
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on from the checkpoint in --out.")
+        bool, option("--resume", help="Continue from the checkpoint in --out.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Train a denoiser. Several GPUs: torchrun --nproc-per-node N -m igsr_lab train ..."""
-    from igsr_lab.denoiser.distributed import is_first_process
     from igsr_lab.denoiser.perceptual_distance import (
         Distance,
         SqueezeNetDistance,
         lpips_distance,
     )
-    from igsr_lab.denoiser.plot_training import plot_training
-    from igsr_lab.denoiser.train_network import WEIGHTS, train
-    from igsr_lab.denoiser.training_run import LOG
+    from igsr_lab.denoiser.train_network import LOG, WEIGHTS, is_first_process, plot_training, train
 
-    with error_messages(
-        lambda: f"Interrupted; go on from the last checkpoint in {out} with --resume."
-    ):
+    with error_messages(lambda: f"Interrupted; continue from the checkpoint in {out} by --resume."):
         if features is not None and lpips is not None:
             raise IgsrError("--features and --lpips both name a perceptual distance; give one.")
         distance: Distance | None = None
         if features is not None:
             distance = SqueezeNetDistance(features)
         elif lpips is not None:
-            distance = lpips_distance(lpips.value)
-        # A fit that was killed leaves a file whose name begins with a dot.
+            distance = lpips_distance(lpips)
+        # Files of killed runs begin with a dot.
         files = sorted(pairs.glob("[!.]*.npz"))
         if not files:
             raise IgsrError(
                 f"{pairs} holds no .npz of pairs; make some with python -m igsr_lab pairs."
             )
-        training = Training(**given)
-        with training_bar(training.steps) as progress:
+        with progress_bar() as progress:
             train(
                 files,
                 out,
-                training,
+                Training(**given),
                 Architecture(width=width, residual=residual, buffers=buffers, photos=photos),
                 distance=distance,
                 start=start,

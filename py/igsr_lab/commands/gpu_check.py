@@ -1,7 +1,7 @@
 """``python -m igsr_lab gpu-check``: test and measure this computer's GPU, and write a report.
 
-The kernels' tests come first; they run on whatever adapter answers. The report is written whether
-they pass or not, or do not end; the exit status is 1 where one fails.
+The kernels' tests run first, on the adapter that igsr uses. The report is written whether they
+pass, fail or hang; the exit status is 1 if one fails.
 """
 
 from __future__ import annotations
@@ -19,38 +19,41 @@ from typing import Annotated, Any
 
 import typer
 
+from igsr.cli.options import option
 from igsr_lab import bench
+from igsr_lab.commands.bench import CaptureOption, GardenOption, SecondsOption
 
 ROOT = Path(__file__).resolve().parents[3]
-COMMAND = ("cargo", "test", "--release", "--locked", "--package", "splat_render", "--no-fail-fast")
-TESTS = tuple(
+BUILD = ("cargo", "test", "--release", "--locked", "--package", "splat_render", "--no-fail-fast")
+TEST_FILES = tuple(
     word
     for name in ("gpu_stages", "gpu_fit", "gpu_density", "gpu_faults")
     for word in ("--test", name)
 )
-#: NVIDIA's driver (580) can spin for ever where threads that used it end while others open devices.
+#: NVIDIA's driver (580) can hang if threads that used it end while others open devices.
 ONE_BY_ONE = ("--", "--test-threads=1")
-#: Seconds that the tests may take once they are built; a software driver takes four minutes.
-TIMEOUT = 1800.0
-#: Seconds that are waited for tests that were ended: a driver may hold them.
-END_TIMEOUT = 10.0
-#: Last lines of the compiler that are shown where the tests do not run.
-SHOWN = 20
+COMMAND = (*BUILD, *TEST_FILES, *ONE_BY_ONE)
+#: Time limit of the built tests; a software driver takes four minutes.
+TIMEOUT_SECONDS = 1800.0
+#: Time limit for killed tests to end: a driver may hold them.
+END_TIMEOUT_SECONDS = 10.0
+#: Number of the compiler's last lines in the report, if the tests do not run.
+SHOWN_LINES = 20
 
 
 def kernel_tests() -> dict[str, Any]:
-    """Build and run the kernels' tests; which passed and which failed."""
-    # Building does not count against the tests' time.
-    built = subprocess.run([*COMMAND, *TESTS, "--no-run"], cwd=ROOT, capture_output=True, text=True)
+    """Build and run the kernels' tests; return which passed and failed."""
+    words = (*BUILD, *TEST_FILES, "--no-run")  # building does not count against the time limit
+    built = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
     if built.returncode != 0:
         return _not_run(built.stdout + built.stderr, 0.0)
-    return run_tests((*COMMAND, *TESTS, *ONE_BY_ONE))
+    return run_tests(COMMAND)
 
 
-def run_tests(command: Sequence[str], timeout: float = TIMEOUT) -> dict[str, Any]:
-    """Run a command that prints as cargo's tests do, and end it where it takes too long."""
+def run_tests(command: Sequence[str], timeout: float = TIMEOUT_SECONDS) -> dict[str, Any]:
+    """Run a command that prints like cargo's tests; kill it after the timeout."""
     began = time.perf_counter()
-    # Files, since whoever reads a pipe to its end waits for what the command started, too.
+    # Files, because a pipe stays open until all children end.
     with tempfile.TemporaryFile() as printed, tempfile.TemporaryFile() as complaints:
         running = subprocess.Popen(
             command, cwd=ROOT, stdout=printed, stderr=complaints, start_new_session=True
@@ -59,10 +62,10 @@ def run_tests(command: Sequence[str], timeout: float = TIMEOUT) -> dict[str, Any
             status: int | None = running.wait(timeout)
         except subprocess.TimeoutExpired:
             status = None
-            _end(running)
+            _kill(running)
         except BaseException:
-            # In a session of its own, it does not get the terminal's Ctrl-C.
-            _end(running)
+            # In its own session, it does not get the terminal's Ctrl-C.
+            _kill(running)
             raise
         seconds = time.perf_counter() - began
         output, errors = (_text(file) for file in (printed, complaints))
@@ -80,15 +83,15 @@ def run_tests(command: Sequence[str], timeout: float = TIMEOUT) -> dict[str, Any
     return _tests(passed, failed, seconds)
 
 
-def _end(running: subprocess.Popen[bytes]) -> None:
-    """End a command and what it started."""
-    with contextlib.suppress(OSError):  # it has just ended by itself
+def _kill(running: subprocess.Popen[bytes]) -> None:
+    """Kill a command and its children."""
+    with contextlib.suppress(OSError):  # it has just ended
         if hasattr(os, "killpg"):
             os.killpg(running.pid, signal.SIGKILL)
         else:
             running.kill()
     with contextlib.suppress(subprocess.TimeoutExpired):
-        running.wait(END_TIMEOUT)
+        running.wait(END_TIMEOUT_SECONDS)
 
 
 def _text(file: Any) -> str:
@@ -97,13 +100,14 @@ def _text(file: Any) -> str:
 
 
 def _not_run(output: str, seconds: float) -> dict[str, Any]:
-    lines = output.splitlines()[-SHOWN:]
-    return _tests(0, ["the tests did not run"], seconds) | {"error": "\n".join(lines)}
+    error = "\n".join(output.splitlines()[-SHOWN_LINES:])
+    return _tests(0, ["the tests did not run"], seconds) | {"error": error}
 
 
 def _tests(passed: int, failed: list[str], seconds: float) -> dict[str, Any]:
+    command = " ".join(COMMAND)
     return {
-        "command": " ".join((*COMMAND, *TESTS, *ONE_BY_ONE)),
+        "command": command,
         "passed": passed,
         "failed": failed,
         "seconds": seconds,
@@ -112,20 +116,10 @@ def _tests(passed: int, failed: list[str], seconds: float) -> dict[str, Any]:
 
 
 def gpu_check_command(
-    out: Annotated[Path, typer.Option("--out", help="Folder for the report.")] = Path(
-        "out/gpu-check"
-    ),
-    garden: Annotated[
-        Path | None,
-        typer.Option("--garden", metavar="FILE", help="For W2: gsplat's test_garden.npz."),
-    ] = None,
-    capture: Annotated[
-        Path | None,
-        typer.Option("--capture", metavar="CAPTURE", help="For W3: photos of 400x400 pixels."),
-    ] = None,
-    seconds: Annotated[
-        float, typer.Option("--seconds", help="How long each row is repeated, in seconds.")
-    ] = 2.0,
+    out: Annotated[Path, option("--out", help="Folder for the report.")] = Path("out/gpu-check"),
+    garden: GardenOption = None,
+    capture: CaptureOption = None,
+    seconds: SecondsOption = 2.0,
 ) -> None:
     """Test the kernels, measure them, and write report.html and report.json into --out.
 

@@ -6,32 +6,23 @@ import os
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
-
 from igsr.cli.error_messages import error_messages
-from igsr.cli.shared import (
-    JsonOption,
-    error_console,
-    output_console,
-    print_json,
-)
+from igsr.cli.options import JsonOption, option
+from igsr.cli.output import error_console, output_console, print_json
 from igsr_lab.commands.options import RayOption
 
 
 def synth_command(
-    scenes: Annotated[int, typer.Option("--scenes", metavar="N", help="How many scenes.")],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of the captures.")],
-    seed: Annotated[
-        int, typer.Option("--seed", help="Random seed. Scenes are deterministic for a given seed.")
-    ] = 0,
-    first: Annotated[int, typer.Option("--first", help="Number of the first scene.")] = 0,
-    size: Annotated[int, typer.Option("--size", help="Longer side of the photos in pixels.")] = 256,
-    views: Annotated[int, typer.Option("--views", help="Train photos per scene.")] = 24,
-    test_views: Annotated[int, typer.Option("--test-views", help="Test photos per scene.")] = 8,
-    spp: Annotated[int, typer.Option("--spp", help="Light paths per pixel, a square number.")] = 16,
+    scenes: Annotated[int, option("--scenes", metavar="N", help="Number of scenes.")],
+    out: Annotated[Path, option("--out", metavar="DIR", help="Folder of the captures.")],
+    seed: Annotated[int, option("--seed", help="Random seed.")] = 0,
+    first: Annotated[int, option("--first", help="Number of the first scene.")] = 0,
+    size: Annotated[int, option("--size", help="Longer side of the photos, pixels.")] = 256,
+    views: Annotated[int, option("--views", help="Train photos per scene.")] = 24,
+    test_views: Annotated[int, option("--test-views", help="Test photos per scene.")] = 8,
+    spp: Annotated[int, option("--spp", help="Light paths per pixel, a square number.")] = 16,
     jobs: Annotated[
-        int | None,
-        typer.Option("--jobs", help="Scenes at the same time, a core each. Default: all."),
+        int | None, option("--jobs", help="Scenes made in parallel. Default: one per core.")
     ] = None,
     ray: RayOption = False,
     as_json: JsonOption = False,
@@ -49,9 +40,9 @@ def synth_command(
         console = error_console()
 
         def on_scene(done: int, total: int, row: dict[str, Any]) -> None:
-            where = "" if row["kind"] == "none" else f", {row['kind']}"
+            kind = "" if row["kind"] == "none" else f", {row['kind']}"
             console.print(
-                f"{done} of {total}: {row['name']} ({', '.join(row['contents'])}{where}) "
+                f"{done} of {total}: {row['name']} ({', '.join(row['contents'])}{kind}) "
                 f"in {row['seconds']:.0f} s"
             )
 
@@ -69,4 +60,4 @@ def synth_command(
         print_json(report)
         return
     made = sum(row["seconds"] is not None for row in report["scenes"])
-    output_console().print(f"{made} made, {scenes - made} there already: {out}", markup=False)
+    output_console().print(f"{made} made, {scenes - made} already finished: {out}", markup=False)

@@ -14,57 +14,43 @@ from igsr.denoiser.inputs import BUFFERS, CHOICES, COLOR, PHOTO
 from igsr_lab.denoiser.pair_files import Pairs, unpacked
 from igsr_lab.denoiser.training_settings import Training
 
-#: Each crop lacks all the buffers, or the photos, this often: renders may come without.
-LACKING = 0.05
-#: A crop whose render is less wrong than this, in squared error, teaches nothing; others are drawn
-#: in its place, at most so many.
-RIGHT, DRAWN_AGAIN = 1e-5, 3
+#: Probability that a crop has no buffers, and that it has no photos: renders may come without.
+DROP_PROBABILITY = 0.05
+#: A crop whose mean squared error is less than this teaches nothing; another one is drawn.
+MIN_ERROR = 1e-5
+#: Maximum number of further draws.
+MAX_REDRAWS = 3
 #: Crops per validation, the same each time.
 VALIDATION_CROPS = 64
-#: Channels that hold colours, three each.
+#: First channels of colors, three each.
 _COLORS = (0, *(COLOR + BUFFERS + k * PHOTO for k in range(CHOICES)))
 _NORMAL_X, _NORMAL_Y = COLOR + 3, COLOR + 4
 
 
 class Crop(NamedTuple):
-    """One crop of one pair.
+    """One crop of one pair."""
 
-    Attributes:
-        inputs: float32 [``CHANNELS``, H, W], what the network sees.
-        truth: float32 [4, H, W], the true colours in [0, 1], and 1 where they are known. Where they
-            are not, they are the render's.
-    """
-
-    inputs: Tensor
+    inputs: Tensor  # float32 [``CHANNELS``, H, W], input of the network
+    #: float32 [4, H, W], the photo's colors in [0, 1], and 1 for known pixels. Unknown pixels have
+    #: the render's colors.
     truth: Tensor
 
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Crops on the device that learns from them.
+    """Crops on the training device."""
 
-    Attributes:
-        inputs: float32 [B, ``CHANNELS``, H, W], channels last in memory.
-        truth: float32 [B, 3, H, W] in [0, 1].
-        known: bool [B, 1, H, W], where the truth is known.
-    """
-
-    inputs: Tensor
-    truth: Tensor
-    known: Tensor
+    inputs: Tensor  # float32 [B, ``CHANNELS``, H, W], channels last in memory
+    truth: Tensor  # float32 [B, 3, H, W] in [0, 1]
+    known: Tensor  # bool [B, 1, H, W], pixels with a known truth
 
 
 def draw_batch(
     pairs: Sequence[Pairs], training: Training, step: int, share: range, device: torch.device
 ) -> Batch:
-    """The crops of one step, drawn by (seed, step) alone: nothing random has to be saved.
+    """Draw the crops of one step; they depend on the seed and the step only.
 
-    Args:
-        pairs: what to draw from; each counts by its number of views.
-        training: batch size, crop size, augmentation and seed.
-        step: steps done before.
-        share: numbers of the crops that this process learns from.
-        device: where the crops go.
+    ``share`` has the indices of the crops of this process.
     """
     random = np.random.default_rng([training.seed, step, 0xBA7C])
     weights = np.array([len(one.truth) for one in pairs], np.float64)
@@ -79,13 +65,13 @@ def draw_batch(
 
 
 def validation_crops(pairs: Sequence[Pairs], side: int) -> list[Crop]:
-    """``VALIDATION_CROPS`` crops, the same for every training, from all of ``pairs`` in turn."""
+    """Draw ``VALIDATION_CROPS`` crops, the same for every training, from all pairs in turn."""
     random = np.random.default_rng(0xDA7A)
     return [_crop(pairs[k % len(pairs)], side, random) for k in range(VALIDATION_CROPS)]
 
 
 def stacked(crops: Sequence[Crop], device: torch.device) -> Batch:
-    """Crops of one size as a batch on ``device``."""
+    """Stack crops of one size."""
     inputs = torch.stack([crop.inputs for crop in crops])
     truth = torch.stack([crop.truth for crop in crops]).to(device)
     inputs = inputs.contiguous(memory_format=torch.channels_last).to(device)
@@ -93,10 +79,9 @@ def stacked(crops: Sequence[Crop], device: torch.device) -> Batch:
 
 
 def _crop_with_errors(pairs: Pairs, side: int, random: np.random.Generator) -> Crop:
-    """A crop that there is something to learn from, if one is found in a few draws."""
-    for _ in range(1 + DRAWN_AGAIN):
+    for _ in range(1 + MAX_REDRAWS):
         crop = _crop(pairs, side, random)
-        if float((crop.inputs[:COLOR] - crop.truth[:COLOR]).square().mean()) > RIGHT:
+        if float((crop.inputs[:COLOR] - crop.truth[:COLOR]).square().mean()) > MIN_ERROR:
             break
     return crop
 
@@ -118,7 +103,7 @@ def _crop(pairs: Pairs, side: int, random: np.random.Generator) -> Crop:
 
 
 def _augmented(crop: Crop, random: np.random.Generator) -> Crop:
-    """Mirrored, turned, with colour channels swapped and exposure changed; sometimes lacking."""
+    """Mirror, permute color channels, change exposure; sometimes drop buffers or photos."""
     inputs, truth = crop.inputs.clone(), crop.truth.clone()
     if random.uniform() < 0.5:
         inputs, truth = inputs.flip(2), truth.flip(2)
@@ -131,8 +116,8 @@ def _augmented(crop: Crop, random: np.random.Generator) -> Crop:
     for at in _COLORS:
         inputs[at : at + 3] = (gain * inputs[at : at + 3][order]).clamp(0.0, 1.0)
     truth[:COLOR] = (gain * truth[:COLOR][order]).clamp(0.0, 1.0)
-    if random.uniform() < LACKING:
+    if random.uniform() < DROP_PROBABILITY:
         inputs[COLOR : COLOR + BUFFERS] = 0.0
-    if random.uniform() < LACKING:
+    if random.uniform() < DROP_PROBABILITY:
         inputs[COLOR + BUFFERS :] = 0.0
     return Crop(inputs, truth)

@@ -1,7 +1,6 @@
-"""What a denoiser is trained to make small: the default and the three losses of the paper.
+"""Losses of the denoiser: the default and the three of the paper.
 
-The default counts ratios: a render that is nearly right and one that is all wrong weigh the same,
-as they do in mean decibels.
+The default uses ratios, so that good and bad renders have the same weight, as in mean decibels.
 """
 
 from __future__ import annotations
@@ -16,79 +15,74 @@ from igsr.errors import IgsrError
 from igsr_lab.denoiser.perceptual_distance import Distance
 from igsr_lab.denoiser.training_settings import LOSSES
 
-#: Parts of the default, beside the squared error's ratio, which counts 1.
-STRUCTURE, PERCEPTUAL, LIKELIHOOD = 1.0, 0.1, 0.1
-#: Part of "charbonnier" that the perceptual distance has.
-CHARBONNIER_PERCEPTUAL = 0.05
-#: SSIM has nothing to say of pictures that are no larger than what it leaves out at the borders.
-STRUCTURE_SIDE = 11
-#: Below this the distance of two colours counts by its square (Charbonnier).
-CHARBONNIER = 1e-3
-#: Squared errors, 1 - SSIM and perceptual distances that need not get smaller.
-SQUARED_FLOOR, STRUCTURE_FLOOR, PERCEPTUAL_FLOOR = 1e-4, 1e-3, 0.01
-#: The perceptual distance is taken of one in so many pictures of a batch: of all of them it would
-#: take half as long again as the network.
-PERCEPTUAL_OF = 3
+#: Weights of the default loss's parts; the squared error's ratio has weight 1.
+STRUCTURE_WEIGHT = 1.0
+PERCEPTUAL_WEIGHT = 0.1
+LIKELIHOOD_WEIGHT = 0.1
+#: Weight of the perceptual distance in loss "charbonnier".
+CHARBONNIER_PERCEPTUAL_WEIGHT = 0.05
+#: SSIM is not defined for smaller pictures.
+MIN_SSIM_SIDE_PX = 11
+#: Smaller color differences count by their square (Charbonnier).
+CHARBONNIER_EPSILON = 1e-3
+#: Squared error, 1 - SSIM and perceptual distance that need not get smaller.
+SQUARED_FLOOR = 1e-4
+STRUCTURE_FLOOR = 1e-3
+PERCEPTUAL_FLOOR = 0.01
+#: The perceptual distance of one in this many pictures of a batch is used; all would take half as
+#: long as the network.
+PERCEPTUAL_EVERY = 3
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a network made of a batch, and what it should have made.
+    """Output of the network for a batch, and its targets."""
 
-    Attributes:
-        render: [B, 3, H, W] in [0, 1], before.
-        image: [B, 3, H, W], after; not clamped.
-        log_error: [B, 1, H, W], natural logarithm of the predicted absolute error.
-        truth: [B, 3, H, W] in [0, 1].
-    """
-
-    render: Tensor
-    image: Tensor
-    log_error: Tensor
-    truth: Tensor
+    render: Tensor  # [B, 3, H, W] in [0, 1], the input
+    image: Tensor  # [B, 3, H, W], the output; not clamped
+    log_error: Tensor  # [B, 1, H, W], natural logarithm of the predicted absolute error
+    truth: Tensor  # [B, 3, H, W] in [0, 1]
 
 
 def charbonnier(prediction: Prediction) -> Tensor:
-    """Mean of sqrt(difference^2 + eps^2) - eps: a smooth absolute error (Charbonnier 1994)."""
+    """Mean of sqrt(difference^2 + eps^2) - eps, a smooth absolute error (Charbonnier 1994)."""
     difference = prediction.image - prediction.truth
-    return ((difference.square() + CHARBONNIER**2).sqrt() - CHARBONNIER).mean()
+    smooth = (difference.square() + CHARBONNIER_EPSILON**2).sqrt()
+    return (smooth - CHARBONNIER_EPSILON).mean()
 
 
 def squared_ratio(prediction: Prediction) -> Tensor:
-    """Mean over pictures of ln(squared error after / before): -0.23 is a decibel gained."""
+    """Mean over pictures of ln(squared error after / before): -0.23 is a gain of 1 dB."""
     after = (prediction.image - prediction.truth).square().mean(dim=(1, 2, 3))
     before = (prediction.render - prediction.truth).square().mean(dim=(1, 2, 3))
     return ((after + SQUARED_FLOOR) / (before + SQUARED_FLOOR)).log().mean()
 
 
 def structure_ratio(prediction: Prediction) -> Tensor:
-    """Mean over pictures of ln((1 - SSIM) after / before), of the means of the colours.
+    """Mean over pictures of ln((1 - SSIM) after / before), of gray pictures.
 
-    Squared errors alone are least where what is uncertain is smooth, which costs structure.
+    The squared error alone favors smooth pictures if the truth is uncertain.
     """
     from torchmetrics.functional.image import structural_similarity_index_measure
 
     def unlike(image: Tensor) -> Tensor:
-        # Of grey pictures it takes a third of the time.
+        # Gray pictures take a third of the time.
         similarity = structural_similarity_index_measure(
-            image.mean(dim=1, keepdim=True), grey, data_range=1.0, reduction="none"
+            image.mean(dim=1, keepdim=True), gray, data_range=1.0, reduction="none"
         )
         assert isinstance(similarity, Tensor)
         return 1.0 - similarity + STRUCTURE_FLOOR
 
-    grey = prediction.truth.mean(dim=1, keepdim=True)
-    if min(grey.shape[-2:]) < STRUCTURE_SIDE:
-        return grey.new_zeros(())
+    gray = prediction.truth.mean(dim=1, keepdim=True)
+    if min(gray.shape[-2:]) < MIN_SSIM_SIDE_PX:
+        return gray.new_zeros(())
     with torch.no_grad():
         before = unlike(prediction.render)
     return (unlike(prediction.image) / before).log().mean()
 
 
 def regret(prediction: Prediction) -> Tensor:
-    """Mean of how much further from the truth colours are than they were; 0 where nearer.
-
-    What was right must stay right: a mean over all pixels would trade it for what was wrong.
-    """
+    """Mean increase of absolute errors; 0 for pixels that improved."""
     before = (prediction.render - prediction.truth).abs()
     after = (prediction.image - prediction.truth).abs()
     return (after - before).clamp_min(0.0).mean()
@@ -97,21 +91,20 @@ def regret(prediction: Prediction) -> Tensor:
 def error_likelihood(prediction: Prediction) -> Tensor:
     """Negative log-likelihood of the error under a Laplace distribution of the predicted scale.
 
-    Its gradient does not reach the picture (Kendall and Gal 2017 let it, which lets hard pixels be
-    given up).
+    Its gradient does not reach the picture; else hard pixels would be given up.
     """
     error = (prediction.image.detach() - prediction.truth).abs().mean(dim=1, keepdim=True)
     return (error * (-prediction.log_error).exp() + prediction.log_error).mean()
 
 
 def perceptual(prediction: Prediction, distance: Distance) -> Tensor:
-    """Mean distance by a perceptual metric of the clamped pictures."""
+    """Mean perceptual distance of the clamped pictures."""
     return distance(_clamped(prediction.image), prediction.truth).mean()
 
 
 def perceptual_ratio(prediction: Prediction, distance: Distance) -> Tensor:
     """Mean of ln(perceptual distance after / before) of a batch's first pictures."""
-    some = slice(-(-len(prediction.image) // PERCEPTUAL_OF))
+    some = slice(-(-len(prediction.image) // PERCEPTUAL_EVERY))
     truth = prediction.truth[some]
     after = distance(_clamped(prediction.image[some]), truth)
     with torch.no_grad():
@@ -120,15 +113,14 @@ def perceptual_ratio(prediction: Prediction, distance: Distance) -> Tensor:
 
 
 def _clamped(image: Tensor) -> Tensor:
-    """``image`` in [0, 1]; gradients pass: colours out of range must be able to come back."""
+    """Clamp to [0, 1], but pass gradients, so that colors out of range can come back."""
     return image + (image.clamp(0.0, 1.0) - image).detach()
 
 
 class Discriminator(nn.Module):
-    """Tells patches of true pictures from others': logits [B, 1, h, w] (Isola et al. 2017)."""
+    """Classifies patches as true or not: logits [B, 1, h, w] (Isola et al. 2017)."""
 
     def __init__(self, width: int = 48) -> None:
-        """Build the layers."""
         super().__init__()
         self.layers = nn.Sequential(
             nn.Conv2d(3, width, 4, stride=2, padding=1),
@@ -143,7 +135,7 @@ class Discriminator(nn.Module):
         )
 
     def forward(self, picture: Tensor) -> Tensor:
-        """Logits of pictures [B, 3, H, W] in [0, 1] being true ones."""
+        """Logits of pictures [B, 3, H, W] in [0, 1]; positive if true."""
         logits: Tensor = self.layers(2.0 * picture - 1.0)
         return logits
 
@@ -155,23 +147,17 @@ class Discriminator(nn.Module):
 
 
 class Loss:
-    """A loss by name; its parts are returned beside the total, for logs.
+    """A loss by name.
 
     Args:
-        name: of ``LOSSES``: "default" (the ratios of the squared error, of 1 - SSIM and, if there
-            is one, of the perceptual distance), "charbonnier" (absolute errors and that distance),
-            "gan", "gan+lpips" ((1 - a) GAN + a LPIPS) or "lpips". The predicted error's likelihood
-            is part of all: without it there is no confidence; its gradient does not reach the
-            picture.
-        distance: the perceptual one, where the loss has it.
+        name: "default" (ratios of the squared error, of 1 - SSIM and of the perceptual distance, if
+            there is one), "charbonnier" (absolute errors and that distance), "gan", "gan+lpips"
+            ((1 - a) GAN + a LPIPS) or "lpips". All include the likelihood of the predicted error.
+        distance: the perceptual distance, or None.
         a: of "gan+lpips"; the paper has 0.9.
-
-    Raises:
-        IgsrError: no such loss, or one that needs a distance without one.
     """
 
     def __init__(self, name: str, distance: Distance | None, a: float = 0.9) -> None:
-        """Check the arguments."""
         if name not in LOSSES:
             raise IgsrError(f"loss must be one of {', '.join(LOSSES)}, not {name!r}")
         if name.endswith("lpips") and distance is None:
@@ -182,18 +168,19 @@ class Loss:
         self.discriminator = Discriminator() if "gan" in name else None
 
     def __call__(self, prediction: Prediction) -> tuple[Tensor, dict[str, float]]:
-        """The total and its parts."""
+        """The total, and its parts by name for the log."""
         parts: dict[str, tuple[float, Tensor]] = {}
         if self.name == "default":
             parts["squared_ratio"] = 1.0, squared_ratio(prediction)
-            parts["structure_ratio"] = STRUCTURE, structure_ratio(prediction)
+            parts["structure_ratio"] = STRUCTURE_WEIGHT, structure_ratio(prediction)
             if self.distance is not None:
-                parts["perceptual_ratio"] = PERCEPTUAL, perceptual_ratio(prediction, self.distance)
+                ratio = perceptual_ratio(prediction, self.distance)
+                parts["perceptual_ratio"] = PERCEPTUAL_WEIGHT, ratio
         elif self.name == "charbonnier":
             parts["charbonnier"] = 1.0, charbonnier(prediction)
             if self.distance is not None:
                 distance = perceptual(prediction, self.distance)
-                parts["perceptual"] = CHARBONNIER_PERCEPTUAL, distance
+                parts["perceptual"] = CHARBONNIER_PERCEPTUAL_WEIGHT, distance
         if self.discriminator is not None:
             weight = 1.0 if self.name == "gan" else 1.0 - self.a
             logits = self.discriminator(_clamped(prediction.image))
@@ -201,7 +188,7 @@ class Loss:
         if self.name.endswith("lpips") and self.distance is not None:
             weight = 1.0 if self.name == "lpips" else self.a
             parts["perceptual"] = weight, perceptual(prediction, self.distance)
-        parts["likelihood"] = LIKELIHOOD, error_likelihood(prediction)
+        parts["likelihood"] = LIKELIHOOD_WEIGHT, error_likelihood(prediction)
         total = torch.stack([weight * part for weight, part in parts.values()]).sum()
         shown = {"total": total} | {name: part for name, (_, part) in parts.items()}
         return total, {name: float(part.detach()) for name, part in shown.items()}

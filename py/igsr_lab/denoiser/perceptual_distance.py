@@ -1,10 +1,9 @@
-"""Perceptual distances: true LPIPS where its backbone can be had, else SqueezeNet's features.
+"""Perceptual distances: LPIPS, or distances of SqueezeNet's features if LPIPS cannot be used.
 
-They are two things. LPIPS (Zhang et al. 2018, v0.1) weights the features of a torchvision backbone
-by calibrated heads; the heads come with torchmetrics, the backbone's weights are torchvision's
-download. The other is the plain distance of features of a fixed, ImageNet-trained SqueezeNet 1.0
-(Iandola et al. 2016) that the user names as a file: it has no calibrated heads and is never called
-LPIPS.
+LPIPS (Zhang et al. 2018, v0.1) weights the features of a torchvision backbone by calibrated heads;
+torchmetrics has the heads, torchvision downloads the backbone. The other distance compares
+features of a fixed, ImageNet-trained SqueezeNet 1.0 (Iandola et al. 2016), read from a file. It has
+no calibrated heads and is not LPIPS.
 """
 
 from __future__ import annotations
@@ -24,35 +23,31 @@ from torch import Tensor, nn
 from igsr._internal.untrusted_npz import DAMAGE
 from igsr.errors import IgsrError
 
-#: Two pictures [B, 3, H, W] in [0, 1] to their distance [B].
+#: From two pictures [B, 3, H, W] in [0, 1] to their distance [B].
 Distance = Callable[[Tensor, Tensor], Tensor]
 
 Backbone = Literal["alex", "vgg", "squeeze"]
 LPIPS_BACKBONES: tuple[Backbone, ...] = get_args(Backbone)
-#: Channels squeezed to and expanded to (half of them by 1x1, half by 3x3) of the fire modules.
-_FIRES = {2: (16, 64), 3: (16, 64), 4: (32, 128), 5: (32, 128), 6: (48, 192), 7: (48, 192)}
-_FIRES |= {8: (64, 256), 9: (64, 256)}
+#: Squeezed channels and expanded channels (by 1x1, and as many by 3x3) of the fire modules.
+FIRES = {2: (16, 64), 3: (16, 64), 4: (32, 128), 5: (32, 128), 6: (48, 192), 7: (48, 192)}
+FIRES |= {8: (64, 256), 9: (64, 256)}
 _POOL_BEFORE = (2, 5, 9)
 #: Layers whose features are compared.
 _COMPARED = ("conv1", "fire3", "fire5", "fire7", "fire9")
-#: Caffe's mean picture, BGR of 255.
+#: Caffe's mean color, BGR of 255.
 _MEAN_BGR = (104.0, 117.0, 123.0)
-#: Smaller pictures leave the deepest layers nothing to look at.
-SMALLEST_SIDE = 32
+#: Minimum side of pictures, for the deepest layers.
+MIN_SIDE_PX = 32
 
 
 class SqueezeNetDistance(nn.Module):
-    """Distance of SqueezeNet 1.0 features, each pixel's normalised to unit length.
+    """Distance of SqueezeNet 1.0 features, normalized to unit length at each pixel.
 
-    The mean over compared layers of the mean over pixels of the squared difference; 0 for equal
-    pictures, about 0.1 to 0.6 for renders of degraded reconstructions. Differentiable; its weights
-    are fixed.
+    The mean over layers of the mean over pixels of the squared difference: 0 for equal pictures,
+    0.1 to 0.6 for renders of degraded reconstructions. Differentiable, with fixed weights.
 
     Args:
         path: ``.npz`` with the Caffe model's arrays ("conv1.weight", "fire2/conv1x1_1.bias").
-
-    Raises:
-        IgsrError: the file is missing or lacks an array.
     """
 
     name = "squeezenet1_0 feature distance"
@@ -60,13 +55,7 @@ class SqueezeNetDistance(nn.Module):
     def __init__(self, path: str | os.PathLike[str]) -> None:
         """Read the weights."""
         super().__init__()
-        shapes: dict[str, tuple[int, ...]] = {"conv1": (96, 3, 7, 7)}
-        channels = 96
-        for number, (squeezed, expanded) in _FIRES.items():
-            shapes[f"fire{number}/conv1x1_1"] = (squeezed, channels, 1, 1)
-            shapes[f"fire{number}/conv1x1_2"] = (expanded, squeezed, 1, 1)
-            shapes[f"fire{number}/conv3x3_2"] = (expanded, squeezed, 3, 3)
-            channels = 2 * expanded
+        shapes = squeezenet_shapes()
         arrays = _arrays(Path(path), shapes)
         self._names = {name: name.replace("/", "_") for name in shapes}
         for name, layer in self._names.items():
@@ -83,16 +72,16 @@ class SqueezeNetDistance(nn.Module):
         return total / len(_COMPARED)
 
     def features(self, picture: Tensor) -> list[Tensor]:
-        """The compared layers' activations of pictures [B, 3, H, W], RGB in [0, 1]."""
-        if min(picture.shape[-2:]) < SMALLEST_SIDE:
+        """Activations of the compared layers for pictures [B, 3, H, W], RGB in [0, 1]."""
+        if min(picture.shape[-2:]) < MIN_SIDE_PX:
             raise IgsrError(
-                f"pictures must be at least {SMALLEST_SIDE} pixels on each side for "
+                f"pictures must be at least {MIN_SIDE_PX} pixels on each side for "
                 f"{self.name}, not {picture.shape[-1]}x{picture.shape[-2]}"
             )
         x = 255.0 * picture.flip(1) - self.mean
         x = self._convolved("conv1", x, stride=2)
         out = [x]
-        for number in _FIRES:
+        for number in FIRES:
             if number in _POOL_BEFORE:
                 x = F.max_pool2d(x, 3, stride=2, ceil_mode=True)
             x = self._convolved(f"fire{number}/conv1x1_1", x)
@@ -113,6 +102,18 @@ class SqueezeNetDistance(nn.Module):
         return F.relu(F.conv2d(x, weight, bias, stride=stride, padding=padding))
 
 
+def squeezenet_shapes() -> dict[str, tuple[int, ...]]:
+    """Shapes of SqueezeNet's weights by layer."""
+    shapes: dict[str, tuple[int, ...]] = {"conv1": (96, 3, 7, 7)}
+    channels = 96
+    for number, (squeezed, expanded) in FIRES.items():
+        shapes[f"fire{number}/conv1x1_1"] = (squeezed, channels, 1, 1)
+        shapes[f"fire{number}/conv1x1_2"] = (expanded, squeezed, 1, 1)
+        shapes[f"fire{number}/conv3x3_2"] = (expanded, squeezed, 3, 3)
+        channels = 2 * expanded
+    return shapes
+
+
 def _unit(features: Tensor) -> Tensor:
     return features / (features.square().sum(dim=1, keepdim=True) + 1e-10).sqrt()
 
@@ -126,39 +127,35 @@ def _arrays(path: Path, shapes: dict[str, tuple[int, ...]]) -> dict[str, Tensor]
                     array = file[f"{name}.{part}"]
                     if array.shape != wanted or array.dtype != np.float32:
                         raise IgsrError(
-                            f"{path}: {name}.{part} is {array.dtype} {list(array.shape)} where "
-                            f"SqueezeNet 1.0 has float32 {list(wanted)}"
+                            f"{path}: {name}.{part} is {array.dtype} {list(array.shape)}, not "
+                            f"float32 {list(wanted)} as in SqueezeNet 1.0"
                         )
                     out[f"{name}.{part}"] = torch.from_numpy(array)
             return out
     except FileNotFoundError as error:
         raise IgsrError(f"{path} does not exist; name a SqueezeNet 1.0 .npz file") from error
     except KeyError as error:
-        raise IgsrError(f"{path} lacks {error.args[0]}; it is no SqueezeNet 1.0") from error
+        raise IgsrError(f"{path} lacks {error.args[0]}; name a SqueezeNet 1.0 file") from error
     except DAMAGE as error:
         if isinstance(error, IgsrError):
             raise
-        raise IgsrError(f"{path} is no whole .npz file; copy it again") from error
+        raise IgsrError(f"{path} is a damaged .npz file; copy it again") from error
 
 
 def lpips_distance(backbone: Backbone) -> Distance:
-    """True LPIPS v0.1 with a torchvision backbone; downloads its weights on first use.
+    """LPIPS v0.1 with a torchvision backbone; its weights are downloaded on first use.
 
     Args:
         backbone: "alex", "vgg" or "squeeze".
-
-    Raises:
-        IgsrError: no such backbone, torchvision is not installed, or its weights cannot be had.
     """
     if backbone not in LPIPS_BACKBONES:
         raise IgsrError(f"backbone must be one of {', '.join(LPIPS_BACKBONES)}, not {backbone!r}")
     try:
+        # Without torchvision, torchmetrics does not define the name.
         from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
-    except ImportError as error:  # torchmetrics leaves the name out where torchvision is missing
-        raise IgsrError("LPIPS needs torchvision; pip install 'igsr[lpips]'") from error
-    try:
+
         metric = LearnedPerceptualImagePatchSimilarity(net_type=backbone, reduction="none")
-    except ModuleNotFoundError as error:
+    except ImportError as error:
         raise IgsrError("LPIPS needs torchvision; pip install 'igsr[lpips]'") from error
     except OSError as error:
         raise IgsrError(
@@ -169,7 +166,7 @@ def lpips_distance(backbone: Backbone) -> Distance:
 
 
 class _Lpips(nn.Module):
-    """LPIPS of pictures [B, 3, H, W] in [0, 1], which it takes in [-1, 1]."""
+    """LPIPS of pictures [B, 3, H, W] in [0, 1]; its network takes them in [-1, 1]."""
 
     def __init__(self, network: nn.Module, backbone: str) -> None:
         super().__init__()
@@ -182,7 +179,7 @@ class _Lpips(nn.Module):
 
 
 def distance_name(distance: Distance | None) -> str | None:
-    """What a distance is, and a hash of its weights: what a result depends on."""
+    """Name of a distance with a hash of its weights."""
     if distance is None:
         return None
     name = getattr(distance, "name", getattr(distance, "__name__", type(distance).__name__))
@@ -196,7 +193,7 @@ def distance_name(distance: Distance | None) -> str | None:
 def picture_distance(
     distance: Distance, first: npt.NDArray[np.uint8], second: npt.NDArray[np.uint8]
 ) -> float:
-    """The distance of two pictures, uint8 [H, W, 3]."""
+    """Distance of two pictures, uint8 [H, W, 3]."""
     one, other = (
         torch.from_numpy(np.moveaxis(picture, -1, 0)[None].astype(np.float32) / 255.0)
         for picture in (first, second)

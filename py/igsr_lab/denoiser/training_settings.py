@@ -1,4 +1,4 @@
-"""How to train. Free of torch, so that the command line can make its options from the settings."""
+"""Settings of a training. This module does not import torch, for the command line."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from igsr._internal.settings import about, validate
 from igsr.denoiser.architecture import MULTIPLE
 from igsr.errors import IgsrError
 
-#: The default and the paper's three, "gan" and those with "lpips"; ``Loss`` says what they are.
+#: The default and the paper's three ("gan" and two with "lpips"); see ``losses.Loss``.
 LossName = Literal["default", "charbonnier", "gan", "gan+lpips", "lpips"]
 LOSSES: tuple[str, ...] = get_args(LossName)
-#: torch's generators take seeds of 64 bits; those of the steps are a million apart.
-MOST_SEED = 2**43
+#: torch's generators take seeds of 64 bits; each step adds to a million times the seed.
+MAX_SEED = 2**43
 
 
 def _crop(name: str, value: Any) -> int:
@@ -24,42 +24,40 @@ def _crop(name: str, value: Any) -> int:
 
 @dataclass(frozen=True)
 class Training:
-    """Settings of a training; stored with the weights that come out.
+    """Settings of a training; stored with the weights.
 
     Raises:
-        IgsrError: a setting cannot be used; the message names it.
+        IgsrError: a setting is invalid; the message names it.
     """
 
     steps: int = field(default=20_000, metadata=about("Training steps.", limits=(1, 10**9)))
     batch: int = field(
-        default=8,
-        metadata=about("Crops per step, of all processes together.", limits=(1, 2**20)),
+        default=8, metadata=about("Crops per step, of all processes together.", limits=(1, 2**20))
     )
     crop: int = field(
         default=128,
         metadata=about(
-            f"Side of a crop, pixels, a multiple of {MULTIPLE}; smaller pictures are taken whole.",
+            f"Side of a crop in pixels, a multiple of {MULTIPLE}; smaller pictures are padded.",
             read=_crop,
         ),
     )
     rate: float = field(
         default=1e-3,
         metadata=about(
-            "Adam's highest learning rate. It warms up over the first hundredth of the steps and "
-            "falls as a cosine.",
+            "Maximum learning rate of Adam; warm-up over the first 1 % of the steps, then cosine "
+            "decay.",
             limits=(1e-12, 1e3),
         ),
     )
     weight_decay: float = field(
         default=1e-4,
-        metadata=about("Decoupled, as in AdamW, in units of the rate.", limits=(0.0, 0.9999)),
+        metadata=about("Decoupled weight decay, as in AdamW.", limits=(0.0, 0.9999)),
     )
     dropout: float = field(
-        default=0.0,
-        metadata=about("Part of the deepest features that is left out.", limits=(0.0, 0.9999)),
+        default=0.0, metadata=about("Dropout of the deepest features.", limits=(0.0, 0.9999))
     )
     augment: bool = field(
-        default=True, metadata=about("Mirror crops, swap colour channels, change exposure.")
+        default=True, metadata=about("Mirror crops, swap color channels, change exposure.")
     )
     loss: LossName = field(
         default="default", metadata=about("gan, gan+lpips and lpips are the paper's.")
@@ -67,10 +65,7 @@ class Training:
     a: float = field(
         default=0.9, metadata=about("Weight of LPIPS in loss gan+lpips.", limits=(0.0, 1.0))
     )
-    seed: int = field(
-        default=0,
-        metadata=about("Training is deterministic for a given seed.", limits=(0, MOST_SEED)),
-    )
+    seed: int = field(default=0, metadata=about("Random seed of training.", limits=(0, MAX_SEED)))
 
     def __post_init__(self) -> None:
         """Check every setting."""

@@ -1,1 +1,1 @@
-"""Measurements of fits in blocks and of levels of detail, on a made-up town."""
+"""Measurements of fits in blocks and of levels of detail, on an artificial town."""

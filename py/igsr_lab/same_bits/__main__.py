@@ -1,20 +1,16 @@
-"""Compares the results of igsr before and after a change, bit for bit.
+"""Compare the results of igsr before and after a change, bit for bit.
 
     python -m igsr_lab.same_bits record before.json     # with the code before the change
     python -m igsr_lab.same_bits check before.json      # with the code after it
 
-Small seeded runs, on photos that this script makes itself: fits, refinements, compactions, renders,
-gradients, scores and files. Only what users call is used: ``igsr.fit`` and the other public
-functions, and the command ``igsr``. The JSON file holds the SHA-256 of each result by a name of
-ours. ``check`` prints for each name whether the result is the same, and exits with 1 if one changed
-or is missing. It takes about three minutes on two cores; ``--only fit render`` runs some parts.
+The runs are small, seeded and use synthetic photos: fits, refinements, compactions, renders,
+gradients, scores and files, through public functions and the command ``igsr``. The JSON file has
+the SHA-256 of each result by name. ``check`` prints whether each result is the same, and exits with
+1 if one changed or is missing. It takes minutes; ``--only fit render`` runs some parts.
 
-The same code gives the same bits on the same machine only. The file therefore says on which devices
-and with which instruction set and versions it was recorded; ``check`` refuses other ones. Where no
-GPU driver answers, install Mesa's software driver, or leave the GPU out of both runs: its results
-are then not in the file.
-
-To run it with the code of another folder, put that folder first: ``PYTHONPATH=/other/py``.
+Bits are repeatable on one machine only, so the file records its devices, instruction set and
+versions, and ``check`` refuses a file with different ones. Without a GPU driver, results of the GPU
+are left out. ``PYTHONPATH=/other/py`` runs the code of another folder.
 """
 
 from __future__ import annotations
@@ -27,8 +23,8 @@ import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
-#: Sums depend on the number of threads that share them; libraries read these when they are loaded.
-#: Mesa's device selection layer waits for a display that may not be there.
+#: Sums depend on the number of threads, which libraries read when they are loaded. Mesa's device
+#: selection layer would wait for a display.
 ENVIRONMENT = {
     "RAYON_NUM_THREADS": "2",
     "OMP_NUM_THREADS": "1",
@@ -39,7 +35,7 @@ ENVIRONMENT = {
 
 
 def record(path: Path, parts: Sequence[str]) -> int:
-    """Run, and write the hashes to a file."""
+    """Run the parts and write their hashes to a file."""
     import igsr
     from igsr_lab.same_bits.runs import all_hashes, machine
 
@@ -52,18 +48,21 @@ def record(path: Path, parts: Sequence[str]) -> int:
 
 
 def check(path: Path, parts: Sequence[str]) -> int:
-    """Run, and compare with the hashes of a file; 1 if one is another one or missing."""
+    """Run the parts and compare with a file; return 1 if a hash differs or is missing."""
     import igsr
     from igsr_lab.same_bits.runs import all_hashes, machine
 
     recorded = json.loads(path.read_text(encoding="utf-8"))
     before, after = recorded["machine"], machine()
-    others = [name for name in before if before[name] != after.get(name)]
-    if others:
-        lines = [f"  {name}: {before[name]} then, {after.get(name)} now" for name in others]
+    lines = [
+        f"  {name}: {value} then, {after.get(name)} now"
+        for name, value in before.items()
+        if value != after.get(name)
+    ]
+    if lines:
         raise SystemExit(
-            f"same_bits: {path} was recorded with something else than what runs here, so its bits "
-            "would differ anyhow:\n" + "\n".join(lines)
+            f"same_bits: {path} was recorded on another machine or with other versions, "
+            "which change the bits:\n" + "\n".join(lines)
         )
     hashes = all_hashes(parts, after["gpu device"] is not None)
     wanted = {
@@ -78,13 +77,13 @@ def check(path: Path, parts: Sequence[str]) -> int:
         print(f"{state:8} {name}")
     kinds = ("same", "changed", "missing", "new")
     counts = {kind: sum(state == kind for state in states.values()) for kind in kinds}
-    told = ", ".join(f"{count} {kind}" for kind, count in counts.items())
-    print(f"{told}, of igsr in {Path(igsr.__file__).parent}")
+    summary = ", ".join(f"{count} {kind}" for kind, count in counts.items())
+    print(f"{summary}, of igsr in {Path(igsr.__file__).parent}")
     return 1 if counts["changed"] or counts["missing"] else 0
 
 
 def main() -> int:
-    """Record or check, as the command line says."""
+    """Parse the command line and run."""
     os.environ.update(ENVIRONMENT)
     import torch
 

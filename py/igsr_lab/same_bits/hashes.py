@@ -1,4 +1,4 @@
-"""What ``same_bits.py`` hashes of a result: its numbers, under names that outlive renames."""
+"""Hashes of results, and the numbers of reports under names that outlive renames."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from PIL import Image
 
 import igsr
 
-#: Keys of reports that were renamed, new to old: ``{"gain": "worth"}``. Files that were recorded
-#: before the rename then still fit. Where a number was moved, its whole path stands here:
-#: ``{"settings.steps": "steps"}``.
+#: Renamed keys of reports, new to old, so that older records still match. A number that was moved
+#: has its whole path here: ``{"settings.steps": "steps"}``.
 REPORT_KEYS: dict[str, str] = {
     "after": "with",
+    "center": "center",
     "cross_validation": "left_out",
     "gain": "worth",
     "mean_confidence": "mean_trust",
@@ -73,17 +73,14 @@ def _feed(sha: Any, value: Any) -> None:
 
 
 def stable_name(path: str) -> str:
-    """The name of a number in a report, ``rounds[].test.psnr``, by the keys that it once had."""
+    """Name of a number in a report (``rounds[].test.psnr``), with renamed keys put back."""
     parts = [part.partition("[") for part in path.split(".")]
     name = ".".join(REPORT_KEYS.get(key, key) + bracket + rest for key, bracket, rest in parts)
     return REPORT_KEYS.get(name, name)
 
 
 def numbers(report: Any) -> dict[str, list[Any]]:
-    """The numbers of a report by stable names, those in lists together, in order.
-
-    Sentences and names are left out: they may be put in other words.
-    """
+    """Numbers of a report by stable name; numbers in lists are joined, and texts left out."""
     found: dict[str, list[Any]] = {}
 
     def walk(value: Any, path: str) -> None:
@@ -106,24 +103,22 @@ def numbers(report: Any) -> dict[str, list[Any]]:
 
 
 def named_numbers(report: Any) -> Results:
-    """Each number of a report by name, without those that are nothing but absent."""
+    """Numbers of a report by name, without names whose values are all None."""
     for name, values in numbers(report).items():
         if any(value is not None for value in values):
             yield name, values
 
 
 def pixels(path: Path) -> np.ndarray:
-    """A picture as it is decoded: how it is packed may change."""
+    """Decoded pixels of a picture; its compression may change."""
     with Image.open(path) as picture:
         return np.asarray(picture)
 
 
 def read_json(path: Path) -> Any:
-    """What a JSON file holds."""
     return json.loads(path.read_text(encoding="utf-8"))
 
 
 def prefixed(prefix: str, results: Results) -> Results:
-    """The results with longer names."""
     for name, value in results:
         yield f"{prefix}.{name}", value

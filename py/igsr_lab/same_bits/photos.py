@@ -1,4 +1,4 @@
-"""Made-up photos for ``same_bits.py``, rendered by igsr and written as captures."""
+"""Small synthetic captures for ``same_bits``, rendered by igsr."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import igsr
 
 
 def made_up_splats(count: int, seed: int, degree: int = 1) -> igsr.Splats:
-    """Coloured splats in a ball of about one unit, many of them flat: corners for features."""
+    """Colored splats in a ball of radius 1; many are flat, which gives corners to match."""
     random = np.random.default_rng(seed)
     directions = random.normal(size=(count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -30,7 +30,7 @@ def made_up_splats(count: int, seed: int, degree: int = 1) -> igsr.Splats:
 
 
 def with_wall(ball: igsr.Splats, seed: int) -> igsr.Splats:
-    """The ball before a wall of coloured splats, which fills photos without alpha."""
+    """Add a wall of colored splats behind the ball, so that photos need no alpha."""
     random = np.random.default_rng(seed)
     count = 700
     means = random.uniform(-3.2, 3.2, size=(count, 3))
@@ -54,7 +54,7 @@ def with_wall(ball: igsr.Splats, seed: int) -> igsr.Splats:
 def camera_at(
     right: float, up: float, width: int, height: int, distance: float = 4.0
 ) -> igsr.Camera:
-    """A camera around the origin, turned by two angles (degrees), looking at it."""
+    """Return a camera that looks at the origin from two angles in degrees."""
     a, b = math.radians(right), math.radians(up)
     back = np.array([math.sin(a) * math.cos(b), -math.sin(b), -math.cos(a) * math.cos(b)])
     z = -back
@@ -69,7 +69,7 @@ def camera_at(
 
 
 def moved(camera: igsr.Camera, random: np.random.Generator, by: float) -> igsr.Camera:
-    """The camera turned by about ``by`` radians and moved by twice as many units."""
+    """Turn a camera by about ``by`` radians and move it by about ``2 * by`` units."""
     turn = random.normal(scale=by, size=3)
     angle = float(np.linalg.norm(turn))
     x, y, z = turn / angle
@@ -81,7 +81,7 @@ def moved(camera: igsr.Camera, random: np.random.Generator, by: float) -> igsr.C
 
 
 def picture_of(splats: igsr.Splats, camera: igsr.Camera, alpha: bool) -> np.ndarray:
-    """A photo of the splats: uint8, with straight alpha or over black."""
+    """Render a uint8 photo, with straight alpha or on black."""
     rendered = igsr.render(splats, camera, backend="reference")
     if not alpha:
         return rendered.to_uint8()
@@ -92,12 +92,12 @@ def picture_of(splats: igsr.Splats, camera: igsr.Camera, alpha: bool) -> np.ndar
 
 
 def opengl_pose(camera: igsr.Camera) -> list[list[float]]:
-    """Camera to world with y up and z back, as NeRF-Synthetic's files have it."""
+    """Camera-to-world matrix in OpenGL axes, as in NeRF-Synthetic's files."""
     return (np.linalg.inv(camera.viewmat) @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist()
 
 
 def write_ball(folder: Path, splats: igsr.Splats) -> Path:
-    """Photos with alpha all around, as NeRF-Synthetic has them: 9 to fit, 3 to test."""
+    """Write a capture in NeRF-Synthetic's layout: 9 photos to fit and 3 to test, with alpha."""
     width, height = 64, 56
     for split, angles in (("train", range(0, 360, 40)), ("test", (20, 140, 260))):
         frames = []
@@ -116,7 +116,7 @@ def write_ball(folder: Path, splats: igsr.Splats) -> Path:
 
 
 def write_room(folder: Path, splats: igsr.Splats) -> Path:
-    """Photos without alpha with a COLMAP text model: cameras a little off, points and tracks."""
+    """Write photos and a COLMAP text model with inexact cameras, points and tracks."""
     width, height = 136, 128
     random = np.random.default_rng(5)
     angles = [(10.0 * (k % 4) - 15.0, 12.0 * (k // 4) - 6.0) for k in range(8)]
@@ -164,7 +164,7 @@ def write_room(folder: Path, splats: igsr.Splats) -> Path:
 
 
 def quaternion(rotation: np.ndarray) -> list[float]:
-    """w x y z of a rotation that turns by less than half a turn."""
+    """Quaternion (w, x, y, z) of a rotation by less than 180 degrees."""
     w = 0.5 * math.sqrt(max(0.0, 1.0 + float(np.trace(rotation))))
     x, y, z = (
         (rotation[2, 1] - rotation[1, 2]) / (4.0 * w),
@@ -175,7 +175,7 @@ def quaternion(rotation: np.ndarray) -> list[float]:
 
 
 def write_bent(folder: Path, splats: igsr.Splats) -> Path:
-    """Photos called bent by a lens, with masks: what is loaded is undistorted."""
+    """Write photos with masks and lens distortion, which igsr removes when it loads them."""
     frames = []
     for number in range(4):
         camera = camera_at(25.0 * number, 5.0, 60, 48)
@@ -203,7 +203,7 @@ def write_bent(folder: Path, splats: igsr.Splats) -> Path:
 
 
 def write_plain_photos(folder: Path) -> Path:
-    """Photos of a painted wall with a step in it, without cameras: COLMAP finds them."""
+    """Write photos of a textured wall with steps in depth, without cameras."""
     folder.mkdir(parents=True)
     random = np.random.default_rng(11)
     size, depth = 420, 3.0
@@ -218,7 +218,7 @@ def write_plain_photos(folder: Path) -> Path:
         rays = np.stack([(u - width / 2) / focal, (v - height / 2) / focal, np.ones_like(u)], -1)
         rays = rays @ camera.viewmat[:3, :3]
         picture = np.zeros((height, width, 3), np.uint8)
-        # The right half of the wall stands back by half a unit, a third of it comes forward.
+        # The right half of the wall is farther away, and its middle nearer.
         for z, low, high in ((0.5, 0.0, 9.0), (0.0, -9.0, 0.0), (-0.4, -0.5, 0.6)):
             reach = (z - camera.center[2]) / rays[..., 2]
             place = camera.center[:2] + reach[..., None] * rays[..., :2]

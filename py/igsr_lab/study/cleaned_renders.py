@@ -1,10 +1,8 @@
-"""What a denoiser makes of the renders of one fit, and what that scores."""
+"""Denoise the renders of one fit, and score them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,34 +11,24 @@ from igsr.denoiser.cleaning import NetworkDenoiser
 from igsr.denoiser.weights import load_network
 from igsr.evaluation.metrics import PSNR_CAP, score
 from igsr_lab.denoiser.pair_files import Pairs, read_pairs, unpacked
-from igsr_lab.denoiser.perceptual_distance import (
-    SMALLEST_SIDE,
-    Distance,
-    SqueezeNetDistance,
-    picture_distance,
-)
+from igsr_lab.denoiser.perceptual_distance import Distance, SqueezeNetDistance
+from igsr_lab.study.scoring import Picture, known_means, masked_distance
+from igsr_lab.study.study import Row
 
 Float64 = npt.NDArray[np.float64]
-Picture = npt.NDArray[np.uint8]
 
-#: Scores by name; None where there is none, as where masks hide all.
+#: Scores by name; None if a score is not defined.
 Scores = dict[str, float | None]
-#: Scores of the table; the lower is the better in the last two. "best_quarter" is the PSNR of the
-#: quarter of each view's pixels that were nearest to the truth before.
+#: Scores of the table; lower is better in the last two. "best_quarter" is the PSNR of the quarter
+#: of each view's pixels that were nearest to the truth before denoising.
 SCORES = ("psnr", "ssim", "ms_ssim", "best_quarter", "flip", "perceptual")
-#: Edges of the confidence's bins.
+#: Edges of the bins of confidence.
 CONFIDENCE_EDGES = np.linspace(0.0, 1.0, 21)
 
 
 @dataclass(frozen=True)
 class Cleaning:
-    """One denoiser on the renders of one fit.
-
-    Attributes:
-        pairs: the renders' file.
-        weights: the denoiser's file; None scores the renders as they are.
-        features: SqueezeNet's arrays, for "perceptual"; None leaves that out.
-    """
+    """Files of one denoiser (None scores the renders themselves) and of the renders of one fit."""
 
     pairs: str
     weights: str | None
@@ -48,54 +36,8 @@ class Cleaning:
 
 
 @dataclass(frozen=True, eq=False)
-class Confidence:
-    """Predicted confidence beside the error that remains, over the renders of one fit.
-
-    Attributes:
-        pixels: [20], pixels by bins of ``CONFIDENCE_EDGES``.
-        confidence: [20], sum of the confidence of those pixels.
-        error: [20], sum of the absolute error of their colours, in [0, 1].
-        mean_error: mean over views of the mean absolute error.
-        weighted_error: the same, each pixel weighted by its confidence.
-    """
-
-    pixels: Float64
-    confidence: Float64
-    error: Float64
-    mean_error: float
-    weighted_error: float
-
-
-@dataclass(frozen=True, eq=False)
-class Cleaned:
-    """What one denoiser scores on the renders of one fit.
-
-    Attributes:
-        scores: means over views, by ``SCORES``.
-        confidence: None for renders as they are.
-    """
-
-    scores: Scores
-    confidence: Confidence | None
-
-    @staticmethod
-    def of_row(row: Mapping[str, Any]) -> Cleaned:
-        """From the row that ``run_cleaning`` made."""
-        found = row.get("confidence")
-        confidence = None if found is None else Confidence(**found)
-        return Cleaned({name: row[name] for name in SCORES}, confidence)
-
-
-@dataclass(frozen=True, eq=False)
 class ViewToClean:
-    """One render as the study sees it.
-
-    Attributes:
-        render: uint8 [H, W, 3].
-        truth: uint8 [H, W, 3], the true picture.
-        mask: bool [H, W], where the true picture is known.
-        inputs: float32 [``CHANNELS``, H, W], what the network sees.
-    """
+    """Render and photo, uint8 [H, W, 3]; mask of known pixels; the network's input."""
 
     render: Picture
     truth: Picture
@@ -104,7 +46,7 @@ class ViewToClean:
 
     @staticmethod
     def of_pairs(pairs: Pairs, number: int) -> ViewToClean:
-        """One of a file's pairs."""
+        """One of the pairs."""
         channels = pairs.inputs[number]
         return ViewToClean(
             _picture(channels[:3]),
@@ -114,11 +56,16 @@ class ViewToClean:
         )
 
 
-def run_cleaning(data: str, one: Cleaning) -> dict[str, Any]:
-    """Clean the renders of one fit and score them; ``data`` is unused. Returns the row."""
-    pairs = read_pairs(one.pairs)
-    denoiser = None if one.weights is None else NetworkDenoiser(load_network(one.weights))
-    distance = None if one.features is None else SqueezeNetDistance(one.features)
+def run_cleaning(data: str, run: Cleaning) -> Row:
+    """Denoise and score the renders of one fit; ``data`` is unused.
+
+    Returns:
+        The row: mean ``SCORES``, "views" with the scores of each, and, with a denoiser,
+        "confidence" (see ``_ConfidenceBins``).
+    """
+    pairs = read_pairs(run.pairs)
+    denoiser = None if run.weights is None else NetworkDenoiser(load_network(run.weights))
+    distance = None if run.features is None else SqueezeNetDistance(run.features)
     bins = _ConfidenceBins()
     views: list[Scores] = []
     for number in range(len(pairs.truth)):
@@ -128,27 +75,17 @@ def run_cleaning(data: str, one: Cleaning) -> dict[str, Any]:
         after = view.render
         if denoiser is not None:
             picture, confidence = denoiser.clean(view.inputs)
-            after = eight_bits(picture)
+            after = to_uint8(picture)
             error = np.abs(picture - view.truth / 255.0).mean(axis=-1)
             bins.add(confidence[view.mask].astype(np.float64), error[view.mask])
         views.append(_scored(view, after, distance))
-    row: dict[str, Any] = {"views": views, **mean_scores(views)}
+    row: Row = {"views": views, **known_means(views, SCORES)}
     if denoiser is not None:
         row["confidence"] = bins.row()
     return row
 
 
-def mean_scores(all_scores: Iterable[Scores]) -> Scores:
-    """Mean of each score over those that have it."""
-    each = list(all_scores)
-    out: Scores = {}
-    for name in SCORES:
-        known = [value for scores in each if (value := scores.get(name)) is not None]
-        out[name] = float(np.mean(known)) if known else None
-    return out
-
-
-def eight_bits(picture: npt.NDArray[np.float32]) -> Picture:
+def to_uint8(picture: npt.NDArray[np.float32]) -> Picture:
     """A picture in [0, 1] as uint8."""
     return np.rint(255.0 * picture).astype(np.uint8)
 
@@ -156,15 +93,12 @@ def eight_bits(picture: npt.NDArray[np.float32]) -> Picture:
 def _scored(view: ViewToClean, after: Picture, distance: Distance | None) -> Scores:
     scores: Scores = dict(score(after, view.truth, None if view.mask.all() else view.mask))
     scores["best_quarter"] = _best_quarter(view, after)
-    if distance is not None and min(view.mask.shape) >= SMALLEST_SIDE:
-        shown = view.mask[..., None]
-        scores["perceptual"] = picture_distance(distance, after * shown, view.truth * shown)
+    if distance is not None:
+        scores["perceptual"] = masked_distance(distance, after, view.truth, view.mask)
     return scores
 
 
 def _best_quarter(view: ViewToClean, after: Picture) -> float:
-    """PSNR after of the quarter of the pixels that were nearest to the truth before."""
-
     def squares(picture: Picture) -> Float64:
         difference = picture.astype(np.float64) - view.truth
         return np.square(difference / 255.0).mean(axis=-1)[view.mask]
@@ -180,14 +114,14 @@ def _picture(channels: Picture) -> Picture:
 
 
 class _ConfidenceBins:
-    """Sums over the pixels of all views, by their confidence."""
+    """Sums over the pixels of all views by bins of confidence: their number, confidence, error."""
 
     def __init__(self) -> None:
         self.pixels, self.confidence, self.error = np.zeros((3, len(CONFIDENCE_EDGES) - 1))
         self.views, self.mean_errors, self.weighted_errors = 0.0, 0.0, 0.0
 
     def add(self, confidence: Float64, error: Float64) -> None:
-        """The pixels of one view: confidence [N] and absolute error [N]."""
+        """Add the pixels of one view: confidence [N] and absolute error [N]."""
         bins = len(self.pixels)
         at = np.clip(np.digitize(confidence, CONFIDENCE_EDGES) - 1, 0, bins - 1)
         self.pixels += np.bincount(at, minlength=bins)
@@ -197,8 +131,8 @@ class _ConfidenceBins:
         self.mean_errors += float(error.mean())
         self.weighted_errors += float(np.sum(confidence * error) / np.sum(confidence))
 
-    def row(self) -> dict[str, Any]:
-        """The fields of ``Confidence`` as JSON has them."""
+    def row(self) -> Row:
+        """The sums by bin, and the mean error of a view, also weighted by confidence."""
         return {
             "pixels": self.pixels.tolist(),
             "confidence": self.confidence.tolist(),

@@ -1,53 +1,43 @@
-"""Degraded reconstructions: fits from few photos or with noisy cameras, whose renders get denoised.
-
-Scenes are fitted from 3, 6 and 9 photos, and from 20 with noise on their cameras. Renders of the
-held-out views are kept beside the true pictures.
-"""
+"""Degraded fits, from few photos or with noise on their cameras, and renders of held-out views."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from igsr._internal.choices import FitBackend
-from igsr._internal.resumable_jobs import Run
+from igsr_lab.resumable_jobs import Run
 from igsr.capture import Capture, View, load_capture
 from igsr.capture.load import holds_cameras
 from igsr.errors import IgsrError
 from igsr.evaluation.scores import known_background
-from igsr.fitting.fit_capture import fit_with_cameras
-from igsr.fitting.presets import PAPER_STEPS, preset_settings
-from igsr_lab.camera_noise import AFFINE, MATRIX, Noise, noise_unit, noisy_view
-from igsr_lab.denoiser.pair_files import write_pairs
-from igsr_lab.denoiser.pair_renders import check_one_size, rendered_pairs
-from igsr_lab.study.real_captures import is_dtu
-from igsr_lab.study.splits import HOLDOUT, dtu_views, llff_views, spread_out
+from igsr.fitting.fit_capture import fit_capture
+from igsr.geometry.camera_noise import AFFINE, MATRIX, Noise, noise_unit, noisy_view
+from igsr_lab.denoiser.pair_files import check_one_size, rendered_pairs, write_pairs
+from igsr_lab.presets import PAPER_STEPS, preset_settings
+from igsr_lab.study.splits import HOLDOUT, dtu_views, is_dtu, llff_views, spread_out
+from igsr_lab.study.study import Row
 
-#: Kinds of degraded fits: numbers of photos; noise on the cameras of 20, made rotations again; and
-#: the same as the paper has it, matrices as they come and 5 000 steps.
+#: Kinds of degraded fits: numbers of photos; 20 photos with noise on their cameras; and the paper's
+#: recipe, with affine noise and its number of steps.
 FEW = ("3", "6", "9")
-NOISE, PAPER = "noise", "paper"
-USUAL = (*FEW, NOISE)
-KINDS = (*USUAL, PAPER)
-NOISY_PHOTOS, CAMERA_NOISE = 20, 0.01
-#: Held-out views scored per fit, at most; evenly spaced ones where there are more.
+NOISE = "noise"
+PAPER = "paper"
+DEFAULT_KINDS = (*FEW, NOISE)
+KINDS = (*DEFAULT_KINDS, PAPER)
+#: Maximum number of photos of fits with noise, and the size of the noise.
+NOISY_PHOTOS = 20
+CAMERA_NOISE = 0.01
+#: Maximum number of held-out views scored per fit, evenly spaced.
 SCORED_VIEWS = 8
 
 
 @dataclass(frozen=True)
 class DegradedFit:
-    """One fit of the study; everything that its renders depend on.
-
-    Attributes:
-        scene: name of the scene's folder in the data, with "/" between folders.
-        kind: of ``KINDS``.
-        seed: of the fit and of the noise.
-        backend: what fits and renders.
-    """
+    """One fit; its renders depend on nothing else. ``kind`` is one of ``KINDS``."""
 
     scene: str
     kind: str
@@ -56,38 +46,21 @@ class DegradedFit:
 
     @property
     def name(self) -> str:
-        """Of its files."""
+        """Name of its files."""
         return f"{self.scene.replace('/', '-')}-{self.kind}-seed{self.seed}-{self.backend}"
 
     def renders(self, out: Path) -> Path:
-        """The file of its renders in the study's folder."""
+        """File of its renders in the study's folder."""
         return out / "renders" / f"{self.name}.npz"
 
 
-@dataclass(frozen=True)
-class PlannedFits:
-    """The fits of a study, checked against the scenes.
-
-    Attributes:
-        runs: one for each fit, in the order of the fits.
-        photographs: scenes whose pictures have no alpha.
-    """
-
-    runs: list[Run]
-    photographs: frozenset[str]
-
-
 def scenes_in(data: Path) -> tuple[str, ...]:
-    """Folders of ``data``, and folders in those, that hold photos with cameras.
-
-    Raises:
-        IgsrError: there are none.
-    """
+    """Find the captures with cameras in a folder and its subfolders."""
     found: list[str] = []
     for pattern in ("*", "*/*"):
         for folder in sorted(data.glob(pattern)):
             name = folder.relative_to(data)
-            # A capture's folder of photos is one too, of the same photos.
+            # The images/ of a capture hold the same photos.
             if name.parent.as_posix() not in found and folder.is_dir() and holds_cameras(folder):
                 found.append(name.as_posix())
     if not found:
@@ -103,96 +76,83 @@ def described(kind: str) -> str:
     return f"at most {NOISY_PHOTOS} photos, {_noise(kind)}{steps}"
 
 
-def planned_fits(data: Path, out: Path, fits: Sequence[DegradedFit]) -> PlannedFits:
-    """What there is to fit. Reads all scenes first: an error in the last must not come hours later.
+def planned_runs(
+    data: Path, out: Path, fits: Sequence[DegradedFit]
+) -> tuple[list[Run], frozenset[str]]:
+    """Load all scenes, so that an error does not come up after hours.
 
-    Args:
-        data: folder that holds the scenes.
-        out: the study's folder.
-        fits: sorted by scene.
-
-    Raises:
-        IgsrError: a scene cannot be read, has too few photos, or views of several sizes.
+    Returns:
+        A run per fit (``fits`` are sorted by scene), and the scenes whose photos have no alpha.
     """
     runs, photographs = [], set()
-    for scene in dict.fromkeys(one.scene for one in fits):
+    for scene in dict.fromkeys(fit.scene for fit in fits):
         capture = load_capture(data / scene)
         if known_background(capture.views) is None:
             photographs.add(scene)
-        for one in (one for one in fits if one.scene == scene):
-            degraded = degraded_capture(capture, one)
+        for fit in (fit for fit in fits if fit.scene == scene):
+            degraded = degraded_capture(capture, fit)
             check_one_size(degraded.test_views)
             photos = len(degraded.train_views)
-            settings = preset_settings("default", photos, steps=_steps(one.kind))
+            settings = preset_settings("default", photos, steps=_steps(fit.kind))
             settings |= {"scored": SCORED_VIEWS}
-            runs.append(Run(one.name, one, settings, one.renders(out), scene))
-    return PlannedFits(runs, frozenset(photographs))
+            runs.append(Run(fit.name, fit, settings, fit.renders(out), scene))
+    return runs, frozenset(photographs)
 
 
-def degraded_capture(capture: Capture, one: DegradedFit) -> Capture:
-    """The photos that a degraded fit has, with the cameras it has, and the views to score.
+def degraded_capture(capture: Capture, fit: DegradedFit) -> Capture:
+    """Choose the photos of a degraded fit, with their cameras, and the views to score.
 
-    A capture with test views is fitted from evenly spaced train views. Others are split as in the
-    few-photos study, and a fit with noise has all photos that are not scored, if fewer than 20.
-
-    Raises:
-        IgsrError: the capture has too few photos.
+    Photos of a capture with test views are evenly spaced train views. Others are split as in
+    ``few_photos``; a fit with noise has at most 20 of the photos that are not scored.
     """
-    train, test = _split(capture, one)
+    train, test = _split(capture, fit)
     test = [test[i] for i in spread_out(len(test), SCORED_VIEWS)]
-    if one.kind in FEW:
+    if fit.kind in FEW:
         return Capture(capture.path, train + test, capture.points)
-    random = np.random.default_rng([one.seed, 0x7AB1, *one.scene.encode()])
-    noise, unit = _noise(one.kind), noise_unit(train)
-    # Points would tell a fit where the cameras were.
+    random = np.random.default_rng([fit.seed, 0x7AB1, *fit.scene.encode()])
+    noise, unit = _noise(fit.kind), noise_unit(train)
+    # Without points, which would reveal the true cameras.
     return Capture(capture.path, [noisy_view(v, noise, random, unit) for v in train] + test, None)
 
 
-def run_fit(out: Path, data: str, one: DegradedFit) -> dict[str, Any]:
-    """Fit, and keep the renders of the held-out views beside the true pictures; returns the row."""
-    capture = degraded_capture(load_capture(Path(data) / one.scene), one)
-    seconds = 0.0
-
-    def progress(now: Any) -> None:
-        nonlocal seconds
-        seconds = now.seconds
-
-    splats, _ = fit_with_cameras(
+def run_fit(out: Path, data: str, fit: DegradedFit) -> Row:
+    """Fit, and write renders and photos of the held-out views; return the row."""
+    capture = degraded_capture(load_capture(Path(data) / fit.scene), fit)
+    result = fit_capture(
         capture,
-        backend=one.backend,
-        seed=one.seed,
-        steps=_steps(one.kind),
-        # Silhouettes of wrong cameras take away what is there.
-        # Few photos have depths; those of rendered captures would tell a fit too much.
+        backend=fit.backend,
+        seed=fit.seed,
+        steps=_steps(fit.kind),
+        # Few photos have depths, and exact depths of rendered captures would help too much.
         depth_weight=0.0,
-        backdrop=False,  # holes are to be seen as such
-        progress=progress,
+        backdrop=False,  # holes must be visible
     )
     background = known_background(capture.views)
-    pairs = rendered_pairs(splats, capture.train_views, capture.test_views, background, one.backend)
-    write_pairs(one.renders(out), pairs)
+    pairs = rendered_pairs(
+        result.splats, capture.train_views, capture.test_views, background, fit.backend
+    )
+    write_pairs(fit.renders(out), pairs)
     return {
-        **vars(one),
+        **vars(fit),
         "photos": len(capture.train_views),
         "renders": len(pairs.truth),
-        "splats": len(splats),
-        "seconds": round(seconds, 2),
+        "splats": len(result.splats),
+        "seconds": round(result.seconds, 2),
     }
 
 
-def _split(capture: Capture, one: DegradedFit) -> tuple[list[View], list[View]]:
+def _split(capture: Capture, fit: DegradedFit) -> tuple[list[View], list[View]]:
     """Photos to fit and photos to score."""
-    noisy = one.kind not in FEW
+    noisy = fit.kind not in FEW
     if capture.test_views:
         train = capture.train_views
-        count = min(NOISY_PHOTOS, len(train)) if noisy else int(one.kind)
+        count = min(NOISY_PHOTOS, len(train)) if noisy else int(fit.kind)
         if count > len(train):
             raise IgsrError(f"{capture.path} has {len(train)} photos to fit, not {count}.")
         return [train[i] for i in spread_out(len(train), count)], capture.test_views
-    few_dtu = is_dtu(one.scene) and not noisy
     rest = len(capture.views) - -(-len(capture.views) // HOLDOUT)
-    count = min(NOISY_PHOTOS, rest) if noisy else int(one.kind)
-    chosen = (dtu_views if few_dtu else llff_views)(capture, count)
+    count = min(NOISY_PHOTOS, rest) if noisy else int(fit.kind)
+    chosen = (dtu_views if is_dtu(fit.scene) and not noisy else llff_views)(capture, count)
     return chosen.train_views, chosen.test_views
 
 

@@ -1,82 +1,56 @@
-"""What ``own_photos`` runs, each in a process of its own: cameras of a scene; one fit, scored."""
+"""Runs of ``own_photos``, each in its own process: cameras of a scene, or one scored fit."""
 
 from __future__ import annotations
 
-import contextlib
 import warnings
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from igsr._internal.atomic_write import atomic_write
 from igsr._internal.choices import FitBackend
-from igsr._internal.part_usage import Parts
+from igsr._internal.part_usage import Meter, Parts
 from igsr.capture import Camera, Capture, View, load_capture
 from igsr.capture.downscaling import resized_camera
-from igsr.capture.photo_folder import FRAMES
+from igsr.capture.photo_folder import FRAMES, photo_sizes
 from igsr.errors import IgsrError
-from igsr.evaluation.contact_sheet import save_sheet, sheet_names
+from igsr.evaluation.contact_sheet import flip_sheet, save_sheet, sheet_names
 from igsr.evaluation.limits import limit_of
 from igsr.evaluation.quick_scores import quick_views, train_photos
 from igsr.evaluation.scores import METRICS, ScoredView, default_background, score_views
-from igsr.fitting.fit_capture import fit_with_cameras
+from igsr.fitting.fit_capture import fit_capture
 from igsr.fitting.pose_refinement import refine_cameras
-from igsr.fitting.presets import Preset
-from igsr.geometry.similarity import similarity_between
-from igsr.pose import check_enough_placed, find_cameras, photos_at, read_found
+from igsr.pose import CameraSettings
+from igsr.pose.cameras_file import KeptCameras, read_cameras_file, write_cameras_file
+from igsr.pose.find import estimated_cameras, photos_at
+from igsr.pose.load import check_enough_placed
 from igsr.splats import Splats
-from igsr_lab.denoiser.perceptual_distance import (
-    SMALLEST_SIDE,
-    SqueezeNetDistance,
-    picture_distance,
-)
-from igsr_lab.study.flip_sheet import flip_sheet
+from igsr_lab.denoiser.perceptual_distance import SqueezeNetDistance
+from igsr_lab.presets import Preset, preset_keywords
 from igsr_lab.study.left_half import LEFT_HALF, left_half_scores
+from igsr_lab.study.scoring import aligned_views, known_means, masked_distance
+from igsr_lab.study.study import Row
 
-#: Pictures on a sheet have at most so many pixels on their longest side: fog must be seen.
-SHEET_SIDE = 640
+#: Longest side of a picture on a sheet: large enough to see fog.
+SHEET_SIDE_PX = 640
 
 
 @dataclass(frozen=True)
 class CameraRun:
-    """The cameras of one scene.
+    """The cameras of one scene, which are written to ``out``.
 
-    Attributes:
-        scene: folder of photos in the data.
-        out: file for the cameras.
-        estimator: a name of ``igsr.pose.registry``, or "auto".
-        max_size: largest that photos will be loaded, for the check of memory; the cameras do not
-            depend on it.
+    ``max_size`` of the photos that are loaded later is for the check of memory.
     """
 
     scene: str
     out: str
-    estimator: str
     max_size: int
 
 
 @dataclass(frozen=True)
 class OwnFit:
-    """One fit of a scene; everything that its scores depend on.
-
-    Attributes:
-        scene: folder of photos in the data.
-        preset: a name of ``igsr.fitting.presets``.
-        seed: of the fit.
-        backend: what fits and renders.
-        holdout: every so many photos one is held out.
-        steps: of the fit; None is the preset's number.
-        max_size: longest side of the photos that are fitted, pixels; None leaves it as it is.
-        score_size: longest side of the photos that are scored, pixels.
-        features: SqueezeNet's arrays, for "perceptual"; None leaves that out.
-        left_half: whether "lh_psnr" and "lh_ssim" are scored.
-        cameras: file of the found cameras; None where the scene's own are used.
-        splats: file that the splats are written to.
-        sheet: file for the sheet of pictures, or None.
-    """
+    """One fit of a scene, with the options of ``own_photos``."""
 
     scene: str
     preset: Preset
@@ -84,145 +58,135 @@ class OwnFit:
     backend: FitBackend
     holdout: int
     steps: int | None
-    max_size: int | None
+    max_size: int
     score_size: int
     features: str | None
     left_half: bool
-    cameras: str | None
-    splats: str
-    sheet: str | None
+    cameras: str | None  # file of the found cameras; None if the scene has cameras
+    splats: str  # file for the splats
+    sheet: str | None  # file for the sheet of pictures, or None
 
 
-def find_scene_cameras(data: str, one: CameraRun) -> dict[str, Any]:
-    """Find a scene's cameras and write them; for a process of its own.
+def find_scene_cameras(data: str, run: CameraRun) -> Row:
+    """Find a scene's cameras and write them; return the row.
 
-    A scene whose cameras cannot be found, or of too few photos, has the row's "failed" say why.
+    "failed" is the reason if too few cameras are found. The file is then empty, so that they are
+    not searched again.
     """
-    parts = Parts()
-    folder = Path(data) / one.scene
-    row: dict[str, Any] = {"scene": one.scene, "failed": None}
-    written = b""
+    folder, meter = Path(data) / run.scene, Meter()
+    settings = CameraSettings()
+    row: Row = {"scene": run.scene, "failed": None}
     try:
-        with parts.measured("cameras"), _warnings() as said:
-            found, _ = find_cameras(folder, one.estimator, max_size=one.max_size)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", UserWarning)
+            found, _ = estimated_cameras(folder, settings, lambda event: None, run.max_size)
+        given = [str(one.message) for one in caught if issubclass(one.category, UserWarning)]
         row["photos"] = len(found.names)
-        row["estimator"] = found.made_by["estimator"]
+        row["estimator"] = settings.estimator
         row["placed"] = len(found.placed)
         row["not_placed"] = found.not_placed
         row["points"] = 0 if found.estimate.points is None else len(found.estimate.points.xyz)
-        row["warnings"] = [*said, *found.estimate.warnings]
-        check_enough_placed(found, {}, allow_missing=False)
-        written = found.to_bytes()
+        row["warnings"] = [*given, *found.estimate.warnings]
+        check_enough_placed(found, settings)
+        usage = meter.lap()
+        write_cameras_file(Path(run.out), KeptCameras(found, photo_sizes(folder), usage))
     except IgsrError as error:
         row["failed"] = str(error)
-    # Where it failed the file is empty, so that it is not tried again.
-    with atomic_write(Path(one.out)) as temporary:
-        temporary.write_bytes(written)
-    return {**row, "parts": parts.plain()}
+        usage = meter.lap()
+        with atomic_write(Path(run.out)):
+            pass
+    return {**row, "parts": {"cameras": usage.plain()}}
 
 
-def fit_and_score(data: str, one: OwnFit) -> dict[str, Any]:
-    """Load, fit and score as ``igsr fit`` does; for a process of its own.
+def fit_and_score(data: str, fit: OwnFit) -> Row:
+    """Load, fit and score as ``igsr fit`` does; return the row.
 
-    Photos are scored at ``score_size``, whatever size was fitted: held-out photos with the cameras
-    that they were given, and ("psnr_refined") with cameras aligned to the fitted ones, where those
-    moved, and then fitted each to its photo; fitted photos with the cameras that the fit ended
-    with.
+    All photos are scored at ``score_size``: held-out photos with their given cameras, and, for
+    "psnr_refined", with cameras aligned to the fitted ones and then fitted to their photos; fitted
+    photos with the cameras at the end of the fit.
     """
     parts = Parts()
     with parts.measured("decode"):
-        capture = _loaded(data, one, one.max_size)
+        capture = _loaded(data, fit, fit.max_size)
     background = default_background(capture)
     with parts.measured("fit"):
-        splats, moved = fit_with_cameras(
-            capture, preset=one.preset, seed=one.seed, steps=one.steps, backend=one.backend
-        )
-        splats.save(one.splats)
-    row: dict[str, Any] = {
-        "scene": one.scene,
-        "preset": one.preset,
-        "seed": one.seed,
-        "backend": one.backend,
+        keywords = preset_keywords(fit.preset, capture)
+        if fit.steps is not None:
+            keywords["steps"] = fit.steps
+        result = fit_capture(capture, seed=fit.seed, backend=fit.backend, **keywords)
+        splats, moved = result.splats, result.capture.train_views
+        splats.save(fit.splats)
+    row: Row = {
+        "scene": fit.scene,
+        "preset": fit.preset,
+        "seed": fit.seed,
+        "backend": fit.backend,
         "train_photos": len(capture.train_views),
         "splats": len(splats),
         "fit_size": _largest(capture.views),
     }
-    was, are = ([view.camera for view in of.train_views] for of in (capture, moved))
-    cameras = {view.name: view.camera for view in moved.train_views}
-    exposures = {view.name: view.exposure for view in moved.train_views}
-    del capture, moved
+    was = [view.camera for view in capture.train_views]
+    are = {view.name: view.camera for view in moved}
+    exposures = {view.name: view.exposure for view in moved}
+    del capture, result, moved  # only photos of one size are in memory
     with parts.measured("score"):
-        scored = _loaded(data, one, one.score_size)
+        scored = _loaded(data, fit, fit.score_size)
         test, train = scored.test_views, train_photos(scored)
         del scored
         row["score_size"] = _largest(test)
-        row |= _held_out_scores(splats, test, background, one)
-        if was != are:
-            train = [_with_camera(view, cameras[view.name]) for view in train]
-            to_fitted = similarity_between(was, are)
-            test = [replace(view, camera=to_fitted.camera(view.camera)) for view in test]
-        refined = refine_cameras(splats, test, background, backend=one.backend)
-        again = _psnr_and_ssim(splats, refined, background, one)
-        for view, (psnr, ssim) in zip(row["views"], again, strict=True):
-            view |= {"psnr_refined": psnr, "ssim_refined": ssim}
+        row |= _held_out_scores(splats, test, background, fit)
+        if was != list(are.values()):
+            train = [_with_camera(view, are[view.name]) for view in train]
+            test = aligned_views(test, was, list(are.values()))
+        refined = refine_cameras(splats, test, background, backend=fit.backend)
         train = [replace(view, exposure=exposures[view.name]) for view in train]
-        of_train = _psnr_and_ssim(splats, train, background, one)
-        row["psnr_refined"], row["ssim_refined"] = _means(again)
-        row["train_psnr"], row["train_ssim"] = _means(of_train)
+        of_test, of_train = (
+            _psnr_and_ssim(splats, views, background, fit) for views in (refined, train)
+        )
+        for view, (psnr, ssim) in zip(row["views"], of_test, strict=True):
+            view |= {"psnr_refined": psnr, "ssim_refined": ssim}
+        row["psnr_refined"], row["ssim_refined"] = np.mean(of_test, axis=0).tolist()
+        row["train_psnr"], row["train_ssim"] = np.mean(of_train, axis=0).tolist()
     row["limit"] = limit_of(row["train_psnr"], row["psnr"], row["psnr_refined"]).plain()
     return {**row, "parts": parts.plain()}
 
 
-def _loaded(data: str, one: OwnFit, max_size: int | None) -> Capture:
-    folder = Path(data) / one.scene
-    if one.cameras is None:
+def _loaded(data: str, fit: OwnFit, max_size: int) -> Capture:
+    folder = Path(data) / fit.scene
+    if fit.cameras is None:
         capture = load_capture(folder, max_size)
-        return capture if capture.test_views else capture.with_holdout(one.holdout)
-    found = read_found(Path(one.cameras))
-    return found.capture(folder, photos_at(folder, FRAMES, max_size)).with_holdout(one.holdout)
+        return capture if capture.test_views else capture.with_holdout(fit.holdout)
+    found = read_cameras_file(Path(fit.cameras)).found
+    return found.capture(folder, photos_at(folder, FRAMES, max_size)).with_holdout(fit.holdout)
 
 
 def _held_out_scores(
-    splats: Splats, views: list[View], background: tuple[float, float, float], one: OwnFit
-) -> dict[str, Any]:
-    """Mean scores and "views", the scores of each; writes the sheet."""
-    shown = sheet_names([view.name for view in views]) if one.sheet is not None else set()
-    distance = None if one.features is None else SqueezeNetDistance(one.features)
+    splats: Splats, views: list[View], background: tuple[float, float, float], fit: OwnFit
+) -> Row:
+    """Mean scores, and "views" with the scores of each; write the sheet."""
+    shown = sheet_names([view.name for view in views]) if fit.sheet is not None else set()
+    distance = None if fit.features is None else SqueezeNetDistance(fit.features)
     pictures: list[ScoredView] = []
-    rows: list[dict[str, Any]] = []
-    for scored in score_views(splats, views, background, one.backend):
-        scores = dict(scored.scores)
-        if distance is not None and min(scored.photo.shape[:2]) >= SMALLEST_SIDE:
-            shown_pixels = True if scored.mask is None else scored.mask[..., None]
-            scores["perceptual"] = picture_distance(
-                distance,
-                np.where(shown_pixels, scored.render, np.uint8(0)),
-                np.where(shown_pixels, scored.photo, np.uint8(0)),
-            )
-        if one.left_half:
-            scores |= left_half_scores(scored.render, scored.photo, scored.mask)
-        rows.append({"name": scored.name, **scores})
+    rows: list[Row] = []
+    for scored in score_views(splats, views, background, fit.backend):
+        row: Row = {"name": scored.name, **scored.scores}
+        if distance is not None:
+            row["perceptual"] = masked_distance(distance, scored.render, scored.photo, scored.mask)
+        if fit.left_half:
+            row |= left_half_scores(scored.render, scored.photo, scored.mask)
+        rows.append(row)
         if scored.name in shown:
             pictures.append(scored)
-    if one.sheet is not None:
-        save_sheet(Path(one.sheet), flip_sheet(pictures, SHEET_SIDE))
-    means: dict[str, Any] = {}
-    for name in (*METRICS, "perceptual", *LEFT_HALF):
-        known = [row[name] for row in rows if row.get(name) is not None]
-        means[name] = float(np.mean(known)) if known else None
-    return {**means, "views": rows}
+    if fit.sheet is not None:
+        save_sheet(Path(fit.sheet), flip_sheet(pictures, SHEET_SIDE_PX))
+    return {**known_means(rows, (*METRICS, "perceptual", *LEFT_HALF)), "views": rows}
 
 
 def _psnr_and_ssim(
-    splats: Splats, views: list[View], background: tuple[float, float, float], one: OwnFit
+    splats: Splats, views: list[View], background: tuple[float, float, float], fit: OwnFit
 ) -> list[tuple[float, float]]:
-    scored = quick_views(splats, views, background, one.backend)
+    scored = quick_views(splats, views, background, fit.backend)
     return [(float(v.scores["psnr"] or 0.0), float(v.scores["ssim"] or 0.0)) for v in scored]
-
-
-def _means(pairs: list[tuple[float, float]]) -> tuple[float, float]:
-    first, second = np.mean(pairs, axis=0)
-    return float(first), float(second)
 
 
 def _largest(views: list[View]) -> list[int]:
@@ -232,15 +196,5 @@ def _largest(views: list[View]) -> list[int]:
 
 
 def _with_camera(view: View, camera: Camera) -> View:
-    """The view with a camera of its photo at another size."""
+    """The view with a camera that was fitted at another size."""
     return replace(view, camera=resized_camera(camera, view.camera.width, view.camera.height))
-
-
-@contextlib.contextmanager
-def _warnings() -> Iterator[list[str]]:
-    """Collect the texts of warnings."""
-    texts: list[str] = []
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", UserWarning)
-        yield texts
-        texts += [str(one.message) for one in caught if issubclass(one.category, UserWarning)]

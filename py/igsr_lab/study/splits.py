@@ -1,4 +1,4 @@
-"""Which photos of a scene a protocol fits and which it scores."""
+"""Which photos of a scene are fitted and which are scored."""
 
 from __future__ import annotations
 
@@ -11,18 +11,14 @@ import numpy.typing as npt
 from igsr.capture import Camera, Capture
 from igsr.errors import IgsrError
 
-#: LLFF's protocol holds out every 8th photo for testing.
+#: LLFF's protocol holds out every 8th photo.
 HOLDOUT = 8
-#: DTU's train photos by number, as PixelNeRF chose them: few-view papers take the first 3, 6 or 9.
+#: DTU's train photos by PixelNeRF; few-view papers take the first 3, 6 or 9.
 DTU_TRAIN = (25, 22, 28, 40, 44, 48, 0, 8, 13)
 
 
 def with_train_views(capture: Capture, ids: Sequence[int]) -> Capture:
-    """The capture with these of its train views, by index, and all of its test views.
-
-    Raises:
-        IgsrError: it has no train view of such an index, or no test views.
-    """
+    """Select train views by index; keep all test views."""
     train = capture.train_views
     if max(ids) >= len(train):
         raise IgsrError(
@@ -33,32 +29,30 @@ def with_train_views(capture: Capture, ids: Sequence[int]) -> Capture:
     return Capture(capture.path, [train[i] for i in ids] + capture.test_views, capture.points)
 
 
+def is_dtu(scene: str) -> bool:
+    """Whether a scene has DTU's split, by its name."""
+    return scene.startswith("dtu")
+
+
 def llff_views(capture: Capture, count: int) -> Capture:
-    """LLFF's few-view split: every 8th photo scored, ``count`` of the rest fitted, evenly spaced.
+    """Split by LLFF's few-view protocol, with photos sorted by name.
 
-    Photos are counted in the order of their names, from 0; photo 0 is scored.
-
-    Raises:
-        IgsrError: the capture has fewer photos to fit.
+    Every 8th photo from 0 is scored; ``count`` evenly spaced ones of the rest are fitted.
     """
-    by_name = sorted(capture.views, key=lambda view: view.name)
-    rest = [i for i in range(len(by_name)) if i % HOLDOUT]
+    rest = [i for i in range(len(capture.views)) if i % HOLDOUT]
     if not 1 <= count <= len(rest):
         raise IgsrError(
-            f"{capture.path} has {len(rest)} photos to fit beside those held out; views must be "
+            f"{capture.path} has {len(rest)} photos to fit besides those held out; views must be "
             f"from 1 to {len(rest)}, not {count}."
         )
     chosen = np.linspace(0, len(rest) - 1, count).round().astype(int)
-    return _split(capture, [rest[k] for k in chosen], range(0, len(by_name), HOLDOUT))
+    return _split(capture, [rest[k] for k in chosen], range(0, len(capture.views), HOLDOUT))
 
 
 def dtu_views(capture: Capture, count: int) -> Capture:
-    """DTU's few-view split: the first ``count`` of ``DTU_TRAIN`` fitted, all other photos scored.
+    """Split by DTU's few-view protocol, with photos sorted by name.
 
-    Photos are counted in the order of their names, from 0.
-
-    Raises:
-        IgsrError: the protocol names fewer photos, or the capture has not those.
+    The first ``count`` photos of ``DTU_TRAIN`` are fitted, all others are scored.
     """
     if not 1 <= count <= len(DTU_TRAIN):
         raise IgsrError(f"views must be from 1 to {len(DTU_TRAIN)} for DTU, not {count}.")
@@ -72,7 +66,6 @@ def dtu_views(capture: Capture, count: int) -> Capture:
 
 
 def _split(capture: Capture, train: Sequence[int], test: Sequence[int]) -> Capture:
-    """These photos, counted in the order of their names, as train and test views."""
     by_name = sorted(capture.views, key=lambda view: view.name)
     views = [replace(by_name[i], split="train") for i in train]
     views += [replace(by_name[i], split="test") for i in test]
@@ -80,13 +73,13 @@ def _split(capture: Capture, train: Sequence[int], test: Sequence[int]) -> Captu
 
 
 def localized(cameras: Sequence[Camera], count: int) -> list[int]:
-    """The ``count`` cameras whose viewing directions are nearest to camera 0's, that one first."""
+    """Choose camera 0 and the cameras with the most similar viewing directions."""
     directions = _directions(cameras)
     return [int(i) for i in np.argsort(-(directions @ directions[0]), kind="stable")[:count]]
 
 
 def scattered(cameras: Sequence[Camera], count: int) -> list[int]:
-    """``count`` cameras with viewing directions far apart: farthest points from camera 0 on."""
+    """Choose camera 0 and others by farthest-point sampling of the viewing directions."""
     directions = _directions(cameras)
     chosen = [0]
     nearest = directions @ directions[0]
@@ -98,10 +91,10 @@ def scattered(cameras: Sequence[Camera], count: int) -> list[int]:
 
 
 def spread_out(total: int, count: int) -> list[int]:
-    """``count`` of ``total`` indices, evenly spaced, both ends among them."""
+    """Choose ``count`` of ``total`` indices, evenly spaced, including both ends."""
     return [int(i) for i in np.linspace(0, total - 1, min(count, total)).round()]
 
 
 def _directions(cameras: Sequence[Camera]) -> npt.NDArray[np.float64]:
-    """Viewing direction of each camera, world frame, float64 [N, 3], of length 1."""
+    """Unit viewing directions in the world frame, float64 [N, 3]."""
     return np.stack([camera.viewmat[2, :3] for camera in cameras]).astype(np.float64)

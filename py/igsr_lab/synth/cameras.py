@@ -1,4 +1,4 @@
-"""Cameras around procedural scenes: orbits, turns, arcs and forward-facing groups."""
+"""Cameras around synthetic scenes: orbits, turns, arcs and forward-facing groups."""
 
 from __future__ import annotations
 
@@ -9,24 +9,18 @@ import numpy as np
 
 from igsr_lab.synth.description import Description
 
-#: The plastic number's powers: the additive recurrence in two dimensions that covers a square most
-#: evenly (Roberts 2018, "The unreasonable effectiveness of quasirandom sequences").
+#: Powers of the plastic number: the additive recurrence that covers a square most evenly (Roberts
+#: 2018, "The unreasonable effectiveness of quasirandom sequences").
 _STEPS = np.array([0.7548776662466927, 0.5698402909980532])
 
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """A pinhole camera with square pixels and its principal point in the middle of the image.
+    """A pinhole camera with square pixels and a centered principal point."""
 
-    Attributes:
-        camera_to_world: float64 [4, 4], OpenGL axes (x right, y up, z back), rigid.
-        field_of_view: horizontal, radians.
-        width, height: pixels.
-    """
-
-    camera_to_world: np.ndarray
-    field_of_view: float
-    width: int
+    camera_to_world: np.ndarray  # float64 [4, 4], OpenGL axes (x right, y up, z back), rigid
+    field_of_view: float  # horizontal, radians
+    width: int  # pixels
     height: int
 
     @property
@@ -35,14 +29,14 @@ class Viewpoint:
         return 0.5 * self.width / math.tan(0.5 * self.field_of_view)
 
     def project(self, point: np.ndarray) -> np.ndarray:
-        """The pixel coordinates [2] (x right, y down; pixel centers at + 0.5) of a world point."""
+        """Pixel coordinates [2] (x right, y down; pixel centers at + 0.5) of a world point."""
         right, up, back = (point - self.camera_to_world[:3, 3]) @ self.camera_to_world[:3, :3]
         middle = 0.5 * np.array([self.width, self.height])
         return np.asarray(np.array([right, -up]) / -back * self.focal + middle)
 
 
 def look_at(center: np.ndarray, target: np.ndarray, roll: float = 0.0) -> np.ndarray:
-    """[4, 4] camera-to-world in OpenGL axes; world z up, then rolled by ``roll`` radians."""
+    """Camera-to-world [4, 4] in OpenGL axes; world z up, then rolled by ``roll`` radians."""
     back = np.asarray(center, dtype=np.float64) - target
     back /= np.linalg.norm(back)
     right = np.cross([0.0, 0.0, 1.0], back)
@@ -58,33 +52,21 @@ def look_at(center: np.ndarray, target: np.ndarray, roll: float = 0.0) -> np.nda
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """The way in which one scene is photographed.
+    """The cameras of one scene."""
 
-    Attributes:
-        kind: "hemisphere", "sphere", "turntable", "arc" or "forward".
-        center: [3], what the cameras look at.
-        distance: mean distance of the cameras from ``center``, world units.
-        azimuth, elevation_sine: the lowest and highest of each; radians, and the sine of them.
-        follow: how much of a camera's offset from the middle of the rig its target has too: 0, all
-            look at one point; 1, all look the same way.
-        unsteadiness: standard deviation of targets in world units and of distances in parts.
-        roll: standard deviation, radians.
-        zoom: standard deviation of the logarithm of the focal length between photos.
-        field_of_view: radians, of the image's width.
-        width, height: pixels.
-    """
-
-    kind: str
-    center: np.ndarray
-    distance: float
-    azimuth: tuple[float, float]
-    elevation_sine: tuple[float, float]
+    kind: str  # "hemisphere", "sphere", "turntable", "arc" or "forward"
+    center: np.ndarray  # [3], the point that the cameras look at
+    distance: float  # mean distance of the cameras from ``center``, world units
+    azimuth: tuple[float, float]  # range, radians
+    elevation_sine: tuple[float, float]  # range
+    #: Fraction of a camera's offset from the rig's middle that its target also has: 0 for one
+    #: common target, 1 for parallel cameras.
     follow: float
-    unsteadiness: float
-    roll: float
-    zoom: float
-    field_of_view: float
-    width: int
+    unsteadiness: float  # relative standard deviation of distances, and of targets
+    roll: float  # standard deviation, radians
+    zoom: float  # standard deviation of the logarithm of focal lengths
+    field_of_view: float  # of the image's width, radians
+    width: int  # pixels
     height: int
 
     def _offset(self, position: np.ndarray, distance: float) -> np.ndarray:
@@ -96,7 +78,7 @@ class Rig:
         return distance * way
 
     def viewpoint(self, rng: np.random.Generator, position: np.ndarray) -> Viewpoint:
-        """A camera at about ``position`` ([2] in [0, 1], across the rig's azimuths and heights)."""
+        """A camera near ``position``, [2] in [0, 1] over the rig's azimuths and heights."""
         distance = self.distance * math.exp(rng.normal(0.0, self.unsteadiness))
         offset = self._offset(position, distance)
         middle = self._offset(np.array([0.5, 0.5]), self.distance)
@@ -109,13 +91,7 @@ class Rig:
 
 
 def draw_rig(rng: np.random.Generator, description: Description, size: int) -> Rig:
-    """A way of photographing the scene.
-
-    Args:
-        rng: draws it.
-        description: of the scene.
-        size: pixels of the images' longer side.
-    """
+    """Draw the cameras of a scene; ``size`` is the images' longer side in pixels."""
     turn = float(rng.uniform(0, 2 * math.pi))
     around = (turn, turn + 2 * math.pi)
     width = height = size
@@ -124,7 +100,7 @@ def draw_rig(rng: np.random.Generator, description: Description, size: int) -> R
         kind = str(rng.choice(["hemisphere", "sphere", "turntable"], p=[0.6, 0.2, 0.2]))
         heights = {"hemisphere": (0.02, 0.95), "sphere": (-0.9, 0.95), "turntable": (0.1, 0.6)}
         view = math.radians(rng.uniform(26.0, 60.0))
-        # So that the ball about the objects fits, or is cropped a very little.
+        # The ball around the objects fits, or is cropped a little.
         distance = description.radius * rng.uniform(0.95, 1.2) / math.sin(0.5 * view)
         rise, azimuth = heights[kind], around
     else:
@@ -165,7 +141,7 @@ def draw_rig(rng: np.random.Generator, description: Description, size: int) -> R
 
 
 def spread(rng: np.random.Generator, count: int, margin: float) -> np.ndarray:
-    """[count, 2] positions for ``Rig.viewpoint``, evenly over the square but for its margin."""
+    """Positions for ``Rig.viewpoint``, [count, 2], evenly over the square without its margin."""
     start = rng.random(2)
     positions = (start + np.arange(1, count + 1)[:, None] * _STEPS) % 1.0
     return np.asarray(margin + (1.0 - 2.0 * margin) * positions)

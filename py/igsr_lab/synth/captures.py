@@ -1,13 +1,13 @@
-"""Procedural captures made one by one or side by side, each a folder that appears when it is whole.
+"""``synthesize``: synthetic captures, each a folder that appears when it is complete.
 
-A capture is in the NeRF-Synthetic layout, with intrinsics for each photo::
+A capture has the NeRF-Synthetic layout, with intrinsics for each photo::
 
     scene_00007/
         transforms_train.json, transforms_test.json
         train/000.png, test/000.png         8-bit sRGB; with straight alpha for the family "object"
         depth/train/000.npy                 float32 [H, W], z along the camera's axis, NaN for none
-        mask/train/000.png                  8-bit: where the objects are
-        scene.json                          what it shows, and all it was made from
+        mask/train/000.png                  8-bit mask of the objects
+        scene.json                          content of the scene, and its recipe
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ import os
 import shutil
 import time
 from collections.abc import Callable
-from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -29,8 +29,7 @@ import psutil
 from PIL import Image
 
 from igsr._internal.atomic_write import check_writable
-from igsr._internal.ray_jobs import RayCluster
-from igsr._internal.worker_processes import worker_processes
+from igsr_lab.resumable_jobs import execute
 from igsr.errors import IgsrError
 from igsr_lab.synth.cameras import Viewpoint, draw_rig
 from igsr_lab.synth.mitsuba_scene import (
@@ -44,21 +43,23 @@ from igsr_lab.synth.mitsuba_scene import (
 from igsr_lab.synth.photographs import choose_viewpoints, exposure
 from igsr_lab.synth.surroundings import draw_description
 
-#: Goes up when the same seed begins to mean other scenes.
+#: Increased when a seed gives other scenes.
 RECIPE_VERSION = 2
-#: Test cameras keep this part of the rig away from its edges: they lie between the others.
+#: Fraction of the rig at its edges without test cameras, so that they lie between training cameras.
 TEST_MARGIN = 0.12
+
+Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class CaptureSettings:
-    """What each scene is photographed with.
+    """Photos of each scene.
 
     Attributes:
-        size: pixels of the longer side, 16 to 4096.
-        views: photos to fit, at least 1.
-        test_views: photos to score.
-        spp: light paths per pixel, the square of a whole number, 1 to 4096.
+        size: longer side in pixels, 16 to 4096.
+        views: number of train photos, at least 1.
+        test_views: number of test photos.
+        spp: light paths per pixel, a square number, 1 to 4096.
 
     Raises:
         IgsrError: one is out of range.
@@ -76,10 +77,7 @@ class CaptureSettings:
         _check_range("test_views", self.test_views, 0, 10_000)
         _check_range("spp", self.spp, 1, 4096)
         if math.isqrt(self.spp) ** 2 != self.spp:
-            raise IgsrError(
-                "spp must be a square such as 9, 16 or 36 (light paths lie in rows), "
-                f"not {self.spp}."
-            )
+            raise IgsrError(f"spp must be a square such as 9, 16 or 36, not {self.spp}.")
 
 
 def _check_range(name: str, value: int, low: int, high: int) -> None:
@@ -97,32 +95,32 @@ def synthesize(
     first: int = 0,
     settings: CaptureSettings | None = None,
     jobs: int = 1,
-    on_scene: Callable[[int, int, dict[str, Any]], None] | None = None,
+    on_scene: Callable[[int, int, Row], None] | None = None,
     ray: bool = False,
-) -> dict[str, Any]:
-    """Make procedural captures; those that are there already stay as they are.
+) -> Row:
+    """Make synthetic captures; finished ones are kept.
 
-    Scene k of a seed is the same whatever ``scenes``, ``first`` and ``jobs`` are, bit for bit on
+    Scene k of a seed does not depend on ``scenes``, ``first`` and ``jobs``: it has the same bits on
     one machine with one version of Mitsuba.
 
     Args:
         out: folder of the scenes' folders, ``scene_00000`` and on.
-        scenes: how many.
-        seed: at least 0.
-        first: the number of the first.
-        settings: what each is photographed with.
-        jobs: scenes at a time, each in a process of one thread.
-        on_scene: called with (done, all, the scene's row) after each scene.
-        ray: scenes are made over a Ray cluster instead, whose machines see ``out`` under the same
-            path (``pip install 'igsr[ray]'``).
+        scenes: number of scenes.
+        seed: random seed.
+        first: number of the first scene.
+        settings: photos of each scene.
+        jobs: number of parallel scenes, each in a process with one thread.
+        on_scene: called with (done, total, row) after each scene.
+        ray: make the scenes on a Ray cluster, whose machines see ``out`` at the same path
+            (``pip install 'igsr[ray]'``).
 
     Returns:
-        {"out", "seed", "scenes": a row for each, in order: name, family, kind, contents, seconds
-        (None where it was there already)}.
+        {"out", "seed", "settings", "scenes"}: a row per scene with name, family, kind, contents and
+        seconds (None if it was finished before).
 
     Raises:
         IgsrError: a number is out of range, Mitsuba or Ray is not installed, the folder cannot be
-            written, or it holds a scene of other settings.
+            written, or it has a scene with other settings.
     """
     settings = settings or CaptureSettings()
     _check_range("scenes", scenes, 1, 100_000)
@@ -130,43 +128,24 @@ def synthesize(
     _check_range("seed", seed, 0, 2**63 - 1)
     _check_range("jobs", jobs, 1, 1024)
     with one_threaded_mitsuba():
-        pass  # what is missing is said before any work
+        pass  # raises if it is not installed
     folder = Path(out)
     check_writable(folder / "scene.json")
-    rows: dict[int, dict[str, Any]] = {}
-    missing = []
+    rows: dict[int, Row] = {}
     for index in range(first, first + scenes):
         row = _finished(folder / scene_name(index), _recipe(seed, index, settings))
-        if row is None:
-            missing.append(index)
-        else:
+        if row is not None:
             rows[index] = row
+    missing = [index for index in range(first, first + scenes) if index not in rows]
 
-    def keep(index: int, row: dict[str, Any]) -> None:
+    def keep(index: int, row: Row) -> None:
         rows[index] = row
         if on_scene is not None:
             on_scene(len(rows), scenes, row)
 
-    if ray and missing:
-        folder.mkdir(parents=True, exist_ok=True)
-        shared = folder.resolve()
-        with RayCluster() as cluster:
-            cluster.check(shared)
-            cluster.run(lambda index: make_scene(shared, seed, index, settings), missing, keep)
-    elif jobs == 1 or len(missing) == 1:
-        for index in missing:
-            keep(index, make_scene(folder, seed, index, settings))
-    elif missing:
-        with worker_processes(min(jobs, len(missing))) as pool:
-            pending = {
-                pool.submit(make_scene, folder, seed, index, settings): index for index in missing
-            }
-            try:
-                for done in as_completed(pending):
-                    keep(pending[done], done.result())
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
+    make = partial(make_scene, folder.resolve(), seed, settings)
+    processes = max(1, min(jobs, len(missing)))
+    execute(make, missing, keep, jobs=processes, ray=ray, shared=folder)
     return {
         "out": str(folder),
         "seed": seed,
@@ -175,64 +154,44 @@ def synthesize(
     }
 
 
-def is_made(
-    out: str | os.PathLike[str], index: int, *, seed: int = 0, settings: CaptureSettings
-) -> bool:
-    """Whether ``synthesize`` would find a scene there already.
-
-    Args:
-        out, seed, settings: as ``synthesize`` takes them.
-        index: the scene's number.
-
-    Raises:
-        IgsrError: the folder holds a scene of other settings, or what is no finished scene.
-    """
-    return _finished(Path(out) / scene_name(index), _recipe(seed, index, settings)) is not None
-
-
 def scene_name(index: int) -> str:
-    """The name of a scene's folder."""
+    """Name of a scene's folder."""
     return f"scene_{index:05d}"
 
 
-def _recipe(seed: int, index: int, settings: CaptureSettings) -> dict[str, Any]:
-    """All that a scene is made from, but for Mitsuba's version."""
+def _recipe(seed: int, index: int, settings: CaptureSettings) -> Row:
+    """Everything that a scene depends on, except Mitsuba's version."""
     return {"version": RECIPE_VERSION, "seed": seed, "index": index, **asdict(settings)}
 
 
-def _finished(folder: Path, recipe: dict[str, Any]) -> dict[str, Any] | None:
-    """The row of a scene that is there already; None where there is none."""
+def _finished(folder: Path, recipe: Row) -> Row | None:
+    """The row of a finished scene, or None."""
     if not folder.exists():
         return None
     path = folder / "scene.json"
     try:
         document = json.loads(path.read_bytes())
         row = {key: document[key] for key in ("family", "kind", "contents")}
-        made_from = document["recipe"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        made_from = {key: document["recipe"].get(key) for key in recipe}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise IgsrError(
-            f"{path} cannot be read, so {folder} is no finished scene; delete the folder to make "
-            "the scene again."
+            f"{path} cannot be read, so {folder} is not a finished scene; delete the folder to "
+            "make the scene again."
         ) from error
     for key, value in recipe.items():
-        if not isinstance(made_from, dict) or made_from.get(key) != value:
-            has = made_from.get(key) if isinstance(made_from, dict) else None
+        if made_from[key] != value:
             raise IgsrError(
-                f"{folder} was made with {key} {has!r}, not {value!r}; give another --out, or "
-                "delete the folder."
+                f"{folder} was made with {key} {made_from[key]!r}, not {value!r}; give another "
+                "--out, or delete the folder."
             )
     return {"name": folder.name, **row, "seconds": None}
 
 
-def make_scene(folder: Path, seed: int, index: int, settings: CaptureSettings) -> dict[str, Any]:
-    """Make one scene in ``folder`` under a temporary name, then rename it; returns its row.
-
-    Raises:
-        IgsrError: as ``synthesize``.
-    """
+def make_scene(folder: Path, seed: int, settings: CaptureSettings, index: int) -> Row:
+    """Make one scene in a temporary folder, then rename that; return the row."""
     started = time.monotonic()
     final = folder / scene_name(index)
-    # Of this process: another may make the same scene at the same time.
+    # Named after this process: another one may make the same scene at the same time.
     unfinished = folder / _unfinished(final.name, os.getpid())
     try:
         _remove_abandoned(folder, final.name)
@@ -245,7 +204,7 @@ def make_scene(folder: Path, seed: int, index: int, settings: CaptureSettings) -
         try:
             unfinished.rename(final)
         except OSError:
-            # The other was first, with the same bits.
+            # Another process was first, with the same bits.
             if _finished(final, document["recipe"]) is None:
                 raise
     except OSError as error:
@@ -257,21 +216,20 @@ def make_scene(folder: Path, seed: int, index: int, settings: CaptureSettings) -
 
 
 def _unfinished(name: str, process: int | str) -> str:
-    """The name of a scene's folder while a process makes it."""
     return f".{name}.{process}.unfinished"
 
 
 def _remove_abandoned(folder: Path, name: str) -> None:
-    """Remove what processes left of a scene that were killed while they made it."""
+    """Remove the files of processes that were killed."""
     for path in folder.glob(_unfinished(name, "*")):
         process = path.name.split(".")[-2]
         if not process.isdigit() or not psutil.pid_exists(int(process)):
             shutil.rmtree(path, ignore_errors=True)
 
 
-def _photograph(folder: Path, seed: int, index: int, settings: CaptureSettings) -> dict[str, Any]:
-    """Write everything of a scene but scene.json, whose content is returned."""
-    # The scene and the photos draw from streams of their own: other settings, the same scene.
+def _photograph(folder: Path, seed: int, index: int, settings: CaptureSettings) -> Row:
+    """Write the photos and cameras of a scene; return the content of scene.json."""
+    # Scene and photos have separate random numbers: other settings give the same scene.
     description = draw_description(np.random.default_rng([seed, index, 0]))
     loaded = load_scene(description)
     rng = np.random.default_rng([seed, index, 1])
@@ -334,7 +292,7 @@ def _write_view(
     Image.fromarray(mask).save(folder / f"mask/{name}.png", optimize=True)
 
 
-def _frame(name: str, viewpoint: Viewpoint) -> dict[str, Any]:
+def _frame(name: str, viewpoint: Viewpoint) -> Row:
     return {
         "file_path": f"./{name}",
         "depth_file_path": f"./depth/{name}.npy",
@@ -349,6 +307,6 @@ def _frame(name: str, viewpoint: Viewpoint) -> dict[str, Any]:
     }
 
 
-def _write_json(path: Path, document: dict[str, Any]) -> None:
+def _write_json(path: Path, document: Row) -> None:
     text = json.dumps(document, indent=1, allow_nan=False)
     path.write_text(text + "\n", encoding="utf-8")

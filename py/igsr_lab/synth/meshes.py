@@ -1,7 +1,7 @@
-"""Triangle meshes made with numpy: what the objects and rooms of procedural captures consist of.
+"""Triangle meshes of the objects and rooms of synthetic captures.
 
-A mesh is (vertices [V, 3] float64, faces [F, 3] int, uv [V, 2] float64); world z is up, lengths are
-world units, and faces need no consistent winding (materials are two-sided).
+A mesh is (vertices [V, 3] float64, faces [F, 3] int, uv [V, 2] float64); z is up, lengths are in
+world units, and winding does not matter, since materials are two-sided.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ Mesh = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def grid_faces(rows: int, columns: int) -> np.ndarray:
-    """int [2 (rows - 1) (columns - 1), 3]: two triangles for each cell of a sheet of points."""
+    """Two triangles for each cell of a sheet of points, int [2 (rows - 1) (columns - 1), 3]."""
     index = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
     triangles = np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)])
@@ -23,16 +23,16 @@ def grid_faces(rows: int, columns: int) -> np.ndarray:
 
 
 def grid_mesh(points: np.ndarray) -> Mesh:
-    """A mesh over a [rows, columns, 3] sheet of points, u along columns, v along rows."""
+    """A mesh of a sheet of points [rows, columns, 3], u along columns, v along rows."""
     rows, columns = points.shape[:2]
     v, u = np.meshgrid(np.linspace(0, 1, rows), np.linspace(0, 1, columns), indexing="ij")
     return points.reshape(-1, 3), grid_faces(rows, columns), np.stack([u, v], -1).reshape(-1, 2)
 
 
 def lathe(profile: Sequence[tuple[float, float]], around: int = 96) -> Mesh:
-    """The (radius, height) profile turned about z, its corners rounded."""
+    """A (radius, height) profile with rounded corners, revolved about z."""
     corners = np.array(profile)
-    for _ in range(3):  # Chaikin's corner cutting, the ends kept
+    for _ in range(3):  # Chaikin's corner cutting, except the ends
         inner = np.empty((2 * len(corners) - 2, 2))
         inner[0::2] = 0.75 * corners[:-1] + 0.25 * corners[1:]
         inner[1::2] = 0.25 * corners[:-1] + 0.75 * corners[1:]
@@ -41,19 +41,19 @@ def lathe(profile: Sequence[tuple[float, float]], around: int = 96) -> Mesh:
     radius, height = corners[:, :1], corners[:, 1:]
     points = np.stack([radius * np.cos(angle), radius * np.sin(angle), height + 0 * angle], axis=-1)
     vertices, faces, uv = grid_mesh(points)
-    # v follows the height, so that painted bands stay level on a curved wall.
+    # v follows the height, so that bands are level on a curved wall.
     span = np.ptp(corners[:, 1])
     uv[:, 1] = (vertices[:, 2] - corners[:, 1].min()) / span
     return vertices, faces, uv
 
 
 def tube(path: np.ndarray, radius: float, closed: bool, around: int = 24) -> Mesh:
-    """A round tube about a [P,3] path; radius in scene units."""
+    """A round tube around a path [P, 3]."""
     tangent = np.gradient(path, axis=0)
     if closed:
         tangent[0] = tangent[-1] = path[1] - path[-2]
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-    # The frame is carried along the path (parallel transport), so that the tube does not twist.
+    # Parallel transport of the frame avoids twists.
     normal = np.cross(tangent[0], [0.31, 0.17, 0.93])
     rings = []
     angle = np.linspace(0, 2 * np.pi, around + 1)[:, None]
@@ -66,7 +66,7 @@ def tube(path: np.ndarray, radius: float, closed: bool, around: int = 24) -> Mes
 
 
 def box(size: tuple[float, float, float]) -> list[Mesh]:
-    """The faces +x, -x, +y, -y, +z, -z of a box standing on z = 0, each with its own [0,1]^2."""
+    """The faces +x, -x, +y, -y, +z, -z of a box standing on z = 0, each with uv in [0, 1]^2."""
     sx, sy, sz = size
     faces = []
     for axis in range(3):
@@ -84,7 +84,7 @@ def box(size: tuple[float, float, float]) -> list[Mesh]:
 
 
 def place(mesh: Mesh, at: Sequence[float] | np.ndarray, turn: float = 0.0) -> Mesh:
-    """The mesh turned about z by ``turn`` radians, then moved by ``at``."""
+    """Turn a mesh about z by ``turn`` radians, then move it by ``at``."""
     vertices, faces, uv = mesh
     cos, sin = math.cos(turn), math.sin(turn)
     rotation = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
@@ -92,7 +92,7 @@ def place(mesh: Mesh, at: Sequence[float] | np.ndarray, turn: float = 0.0) -> Me
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Area-weighted; vertices that lie together (a seam) share one normal, so that none shows."""
+    """Area-weighted normals; vertices at the same place share one, so that seams are invisible."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     face = np.cross(b - a, c - a)
     _, together = np.unique(np.round(vertices, 6), axis=0, return_inverse=True)
@@ -107,13 +107,13 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def transformed(
     mesh: Mesh, matrix: np.ndarray, at: Sequence[float] | np.ndarray = (0, 0, 0)
 ) -> Mesh:
-    """The mesh under x -> matrix x + at; matrix [3, 3]."""
+    """Map a mesh by x -> matrix x + at; matrix [3, 3]."""
     vertices, faces, uv = mesh
     return vertices @ np.asarray(matrix).T + np.asarray(at), faces, uv
 
 
 def rotation(axis: Sequence[float] | np.ndarray, angle: float) -> np.ndarray:
-    """[3, 3]: turns by ``angle`` radians about ``axis`` (Rodrigues' formula)."""
+    """Rotation by ``angle`` radians about ``axis``, [3, 3] (Rodrigues' formula)."""
     x, y, z = np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross
@@ -122,7 +122,7 @@ def rotation(axis: Sequence[float] | np.ndarray, angle: float) -> np.ndarray:
 def superquadric(
     roundness: tuple[float, float], size: Sequence[float] | np.ndarray, segments: int = 40
 ) -> Mesh:
-    """A superquadric ellipsoid (Barr 1981) about the origin.
+    """A superquadric ellipsoid (Barr 1981) around the origin.
 
     Args:
         roundness: exponents along the meridian and around: 1 is an ellipsoid, towards 0 a box,
@@ -149,13 +149,12 @@ def superquadric(
 
 
 def lumpy_ball(rng: np.random.Generator, depth: float, waves: float, segments: int = 64) -> Mesh:
-    """A unit ball displaced along its radius by random plane waves.
+    """A unit ball whose radius is displaced by random plane waves.
 
     Args:
         rng: draws the waves.
-        depth: largest displacement in radii, under 1.
-        waves: how many waves go through a ball of that size; large ones make rocks, small ones
-            potatoes.
+        depth: maximum displacement in radii, under 1.
+        waves: number of waves through the ball; many make rocks, few make potatoes.
         segments: cells around.
     """
     polar = np.linspace(0, np.pi, segments // 2 + 1)[:, None]
@@ -168,7 +167,7 @@ def lumpy_ball(rng: np.random.Generator, depth: float, waves: float, segments: i
         ],
         axis=-1,
     )
-    # So that the seam closes and the poles are one point each, whatever cos and sin round to.
+    # Close the seam and the poles exactly, despite rounding.
     ball[:, -1] = ball[:, 0]
     ball[[0, -1]] = ball[[0, -1], :1]
     directions = rng.normal(size=(8, 3))
@@ -183,13 +182,13 @@ def lumpy_ball(rng: np.random.Generator, depth: float, waves: float, segments: i
 def prism(
     outline: np.ndarray, height: float, twist: float = 0.0, taper: float = 1.0, levels: int = 12
 ) -> list[Mesh]:
-    """The wall, bottom and top of an outline drawn up along z from 0.
+    """The wall, bottom and top of an outline extruded along z from 0.
 
     Args:
-        outline: [P, 2], star-shaped about the origin, not closed.
+        outline: [P, 2], star-shaped around the origin, not closed.
         height: of the top.
-        twist: radians that the top is turned by.
-        taper: size of the top, that of the bottom being 1.
+        twist: rotation of the top, radians.
+        taper: size of the top relative to the bottom.
         levels: rows of the wall.
     """
     ring = np.concatenate([outline, outline[:1]])
@@ -214,7 +213,7 @@ def prism(
 
 
 def star(points: int, inner: float, per_edge: int = 1) -> np.ndarray:
-    """[2 points per_edge, 2]: an outline of radius 1 with tips; ``inner`` is its smaller radius."""
+    """Outline of a star, [2 points per_edge, 2], of radius 1 and smaller radius ``inner``."""
     corners = np.arange(2 * points)
     radius = np.where(corners % 2 == 0, 1.0, inner)
     angle = corners * np.pi / points
@@ -225,14 +224,14 @@ def star(points: int, inner: float, per_edge: int = 1) -> np.ndarray:
 
 
 def gear(teeth: int, depth: float) -> np.ndarray:
-    """[4 teeth, 2]: the outline of a toothed wheel of radius 1; ``depth`` of its teeth."""
+    """Outline of a gear of radius 1, [4 teeth, 2]; ``depth`` of its teeth."""
     angle = (np.arange(4 * teeth) + np.tile([0.0, 0.25, -0.25, 0.0], teeth)) * np.pi / (2 * teeth)
     radius = np.tile([1.0 - depth, 1.0, 1.0, 1.0 - depth], teeth)
     return radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
 
 
 def disc(radius: float, rings: int = 2, around: int = 48) -> Mesh:
-    """A flat disc in z = 0, its texture a square picture seen through the disc."""
+    """A flat disc in z = 0, with a square texture."""
     angle = np.linspace(0, 2 * np.pi, around + 1)
     distance = np.linspace(0, radius, rings + 1)[:, None]
     points = np.stack(
@@ -243,7 +242,7 @@ def disc(radius: float, rings: int = 2, around: int = 48) -> Mesh:
 
 
 def sheet(width: float, depth: float, heights: np.ndarray | None = None) -> Mesh:
-    """A rectangle about the origin in z = 0, or over it a field of ``heights`` [rows, columns]."""
+    """A rectangle around the origin in z = 0, or at ``heights`` [rows, columns]."""
     heights = np.zeros((2, 2)) if heights is None else heights
     rows, columns = heights.shape
     y, x = np.meshgrid(
@@ -255,7 +254,7 @@ def sheet(width: float, depth: float, heights: np.ndarray | None = None) -> Mesh
 
 
 def leaf(length: float, width: float, bend: float) -> Mesh:
-    """A pointed leaf along +x from the origin, in z = 0 at its foot; ``bend`` radians downwards."""
+    """A pointed leaf along +x from the origin, bent downwards by ``bend`` radians."""
     along = np.linspace(0, 1, 9)
     across = np.linspace(-1, 1, 5)
     half = 0.5 * width * np.sin(np.pi * along**0.8) ** 0.9
@@ -273,7 +272,7 @@ def leaf(length: float, width: float, bend: float) -> Mesh:
 
 
 def joined(meshes: Sequence[Mesh]) -> Mesh:
-    """Several meshes as one."""
+    """Join meshes."""
     offsets = np.cumsum([0] + [len(mesh[0]) for mesh in meshes[:-1]])
     return (
         np.concatenate([mesh[0] for mesh in meshes]),

@@ -1,7 +1,7 @@
-"""The one place that knows Mitsuba 3: descriptions become its scenes, viewpoints its sensors.
+"""Mitsuba 3: make its scenes and sensors from descriptions and viewpoints, and render them.
 
-Everything runs in the variant ``scalar_rgb``, which needs no driver and no LLVM. Its numbers do not
-depend on the number of threads: images are cut into blocks of a fixed size, each with its own seed.
+The variant ``scalar_rgb`` needs no driver and no LLVM. Its results do not depend on the number of
+threads: images are divided into blocks of a fixed size, each with its own seed.
 """
 
 from __future__ import annotations
@@ -21,29 +21,24 @@ from igsr_lab.synth.meshes import Mesh, vertex_normals
 from igsr_lab.synth.textures import to_linear, to_srgb
 
 VARIANT = "scalar_rgb"
-#: Surfaces on a light path and the light at its end: each further one costs as much time again and
-#: shows in nothing but darker corners.
+#: Maximum length of light paths; longer ones only brighten dark corners.
 MAX_DEPTH = 3
-#: Pixels per side of the blocks that are rendered and seeded by themselves.
-BLOCK_SIZE = 32
-#: Where rays begin, z along the camera's axis in world units.
+#: Side of the blocks that are rendered with one seed.
+BLOCK_SIZE_PX = 32
+#: Start of rays, z along the camera's axis, world units.
 NEAR_CLIP = 0.01
 
 
 @contextlib.contextmanager
 def one_threaded_mitsuba() -> Iterator[Any]:
-    """Mitsuba with our variant set and one thread; afterwards as it was.
-
-    Raises:
-        IgsrError: it, or Open Image Denoise, is not installed.
-    """
+    """Set Mitsuba's variant and one thread; restore both at the end."""
     try:
         import drjit
         import mitsuba
         import pyoidn  # noqa: F401
     except ImportError as error:
         raise IgsrError(
-            "Procedural captures need Mitsuba 3 and Open Image Denoise; install them with: "
+            "Synthetic captures need Mitsuba 3 and Open Image Denoise; install them with: "
             "pip install 'igsr[synth]'."
         ) from error
     variant, threads = mitsuba.variant(), drjit.thread_count()
@@ -58,7 +53,7 @@ def one_threaded_mitsuba() -> Iterator[Any]:
 
 
 def bitmap(picture: np.ndarray) -> dict[str, Any]:
-    """A texture, sRGB in [0, 1], [H, W, 3], as Mitsuba's dictionary."""
+    """Mitsuba's dictionary of a texture, sRGB in [0, 1], [H, W, 3]."""
     import mitsuba as mi
 
     return {
@@ -70,7 +65,7 @@ def bitmap(picture: np.ndarray) -> dict[str, Any]:
 
 
 def shape(mesh: Mesh, bsdf: Any, smooth: bool = True) -> Any:
-    """A Mitsuba mesh with a loaded BSDF; ``smooth`` interpolates its normals."""
+    """A Mitsuba mesh with a BSDF; ``smooth`` interpolates normals."""
     import mitsuba as mi
 
     vertices, faces, uv = mesh
@@ -100,19 +95,19 @@ def _bsdf(material: Material) -> Any:
 
     if material.kind == "glass":
         return mi.load_dict({"type": "dielectric", "int_ior": 1.5})
-    if material.colour.ndim == 3:
-        colour = bitmap(material.colour)
+    if material.color.ndim == 3:
+        color = bitmap(material.color)
     else:
-        colour = {"type": "rgb", "value": to_linear(material.colour).tolist()}
+        color = {"type": "rgb", "value": to_linear(material.color).tolist()}
     inner: dict[str, Any]
     if material.kind == "matte":
-        inner = {"type": "diffuse", "reflectance": colour}
+        inner = {"type": "diffuse", "reflectance": color}
     elif material.kind == "glossy":
         inner = {
             "type": "roughplastic",
             "distribution": "ggx",
             "alpha": material.roughness,
-            "diffuse_reflectance": colour,
+            "diffuse_reflectance": color,
             "nonlinear": True,
         }
     else:
@@ -121,7 +116,7 @@ def _bsdf(material: Material) -> Any:
             "material": "none",  # a perfect mirror, tinted
             "distribution": "ggx",
             "alpha": material.roughness,
-            "specular_reflectance": colour,
+            "specular_reflectance": color,
         }
     return mi.load_dict({"type": "twosided", "bsdf": inner})
 
@@ -129,7 +124,7 @@ def _bsdf(material: Material) -> Any:
 def _lamp(light: Light) -> dict[str, Any]:
     import mitsuba as mi
 
-    # Any direction that is not the light's own will do for up.
+    # Any up direction except the light's.
     way = np.abs(light.towards - light.at)
     up = np.eye(3)[int(way.argmin())]
     to_world = mi.ScalarTransform4f().look_at(
@@ -147,21 +142,15 @@ def _lamp(light: Light) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class LoadedScene:
-    """A description in Mitsuba's hands.
+    """A scene in Mitsuba."""
 
-    Attributes:
-        scene: Mitsuba's.
-        objects: the scene's objects alone.
-        transparent: whether photos show nothing where nothing is hit, instead of the sky.
-    """
-
-    scene: Any
-    objects: Any
-    transparent: bool
+    scene: Any  # the whole scene
+    objects: Any  # its objects only
+    transparent: bool  # whether the background of photos is transparent
 
 
 def load_scene(description: Description) -> LoadedScene:
-    """The description as a scene to be photographed."""
+    """Load a description."""
     import mitsuba as mi
 
     bsdfs: dict[int, Any] = {}
@@ -192,10 +181,10 @@ def load_scene(description: Description) -> LoadedScene:
 
 
 def sensor(viewpoint: Viewpoint, sampler: dict[str, Any]) -> Any:
-    """The viewpoint as Mitsuba's camera; each pixel is the plain average over its own square."""
+    """Mitsuba's camera of a viewpoint; each pixel is the average over its square."""
     import mitsuba as mi
 
-    # Mitsuba's camera looks along +z with x to the left: turned half round the y axis.
+    # Mitsuba's camera looks along +z with x to the left.
     to_world = viewpoint.camera_to_world @ np.diag([-1.0, 1.0, -1.0, 1.0])
     return mi.load_dict(
         {
@@ -217,16 +206,10 @@ def sensor(viewpoint: Viewpoint, sampler: dict[str, Any]) -> Any:
 
 
 def take_photo(loaded: LoadedScene, viewpoint: Viewpoint, samples: int, seed: int) -> np.ndarray:
-    """Linear premultiplied RGBA, float32 [H, W, 4], without the light paths' noise.
+    """Render linear premultiplied RGBA, float32 [H, W, 4].
 
-    Open Image Denoise takes that out of the colours, by the albedo and the normal of what each
-    pixel shows. A network that learns from these photos would learn to paint the noise.
-
-    Args:
-        loaded: the scene.
-        viewpoint: the camera.
-        samples: light paths per pixel.
-        seed: of the light paths.
+    Open Image Denoise removes the noise of light paths, using albedo and normals: a network trained
+    on these photos would learn to paint the noise.
     """
     import mitsuba as mi
     import pyoidn
@@ -235,13 +218,13 @@ def take_photo(loaded: LoadedScene, viewpoint: Viewpoint, samples: int, seed: in
         "type": "path",
         "max_depth": MAX_DEPTH,
         "hide_emitters": loaded.transparent,
-        "block_size": BLOCK_SIZE,
+        "block_size": BLOCK_SIZE_PX,
     }
     integrator = mi.load_dict(
         {
             "type": "aov",
             "aovs": "albedo:albedo,normal:sh_normal",
-            "block_size": BLOCK_SIZE,
+            "block_size": BLOCK_SIZE_PX,
             "paths": paths,
         }
     )
@@ -257,24 +240,24 @@ def take_photo(loaded: LoadedScene, viewpoint: Viewpoint, samples: int, seed: in
 
 
 def first_hits(loaded: LoadedScene, viewpoint: Viewpoint) -> tuple[np.ndarray, np.ndarray]:
-    """What the ray through each pixel's center meets first.
+    """Depth and object mask at the center of each pixel.
 
     Returns:
-        The z-depth along the camera's axis, float32 [H, W], world units, NaN where nothing is hit;
-        and whether it is an object's, bool [H, W].
+        z-depth along the camera's axis, float32 [H, W], world units, NaN for none; and whether an
+        object is hit, bool [H, W].
     """
     import mitsuba as mi
 
-    # One sample in the middle of its only stratum: the pixel's center.
+    # One sample without jitter is at the pixel's center.
     camera = sensor(viewpoint, {"type": "stratified", "sample_count": 1, "jitter": False})
-    integrator = mi.load_dict({"type": "depth", "block_size": BLOCK_SIZE})
+    integrator = mi.load_dict({"type": "depth", "block_size": BLOCK_SIZE_PX})
 
     def distances(scene: Any) -> np.ndarray:
         far = np.array(mi.render(scene, sensor=camera, integrator=integrator, spp=1))[..., 0]
         return np.where(far > 0.0, far, np.inf).astype(np.float64)
 
     far = distances(loaded.scene)
-    # The same triangle at the same distance, but for rounding in another search tree.
+    # The same triangle has the same distance, except for rounding.
     is_object = np.isfinite(far) & (distances(loaded.objects) <= far * (1.0 + 1e-5))
     x = (np.arange(viewpoint.width) + 0.5 - 0.5 * viewpoint.width) / viewpoint.focal
     y = (np.arange(viewpoint.height) + 0.5 - 0.5 * viewpoint.height) / viewpoint.focal
@@ -284,20 +267,20 @@ def first_hits(loaded: LoadedScene, viewpoint: Viewpoint) -> tuple[np.ndarray, n
 
 
 def encode(linear: np.ndarray) -> np.ndarray:
-    """Premultiplied linear RGBA -> straight 8-bit sRGB RGBA, black where nothing was hit."""
+    """Convert premultiplied linear RGBA to straight 8-bit sRGB RGBA, with a black background."""
     alpha = np.clip(linear[..., 3:], 0.0, 1.0)
-    colour = np.clip(linear[..., :3] / np.maximum(alpha, 1e-6), 0.0, 1.0)
-    pixels = np.round(255.0 * np.concatenate([to_srgb(colour), alpha], axis=-1)).astype(np.uint8)
+    color = np.clip(linear[..., :3] / np.maximum(alpha, 1e-6), 0.0, 1.0)
+    pixels = np.round(255.0 * np.concatenate([to_srgb(color), alpha], axis=-1)).astype(np.uint8)
     pixels[pixels[..., 3] == 0] = 0
     return pixels
 
 
 def camera_error(viewpoints: Sequence[Viewpoint], lamps: np.ndarray, radius: float) -> float:
-    """How far in pixels lamps appear at most from where the viewpoints project them.
+    """Maximum distance in pixels between rendered and projected lamps.
 
     Args:
         viewpoints: each sees every lamp.
-        lamps: [N, 3], centers of small shining balls.
+        lamps: [N, 3], centers of small luminous balls.
         radius: of the balls, world units.
     """
     import mitsuba as mi

@@ -1,4 +1,4 @@
-"""Viewpoints that show something, and an exposure that suits them."""
+"""Viewpoints from which objects are visible, and a suitable exposure."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from igsr_lab.synth.cameras import Rig, Viewpoint, spread
 from igsr_lab.synth.description import Description
 from igsr_lab.synth.mitsuba_scene import LoadedScene, first_hits, take_photo
 
-#: Pixels of the longer side of the small pictures by which viewpoints and exposures are judged.
-PROBE_SIZE = 40
-#: Viewpoints tried for one photo before the best of them is taken.
+#: Longer side of the small renders that viewpoints and exposures are chosen by.
+PROBE_SIZE_PX = 40
+#: Maximum number of viewpoints tried for one photo.
 ATTEMPTS = 12
 
 
@@ -24,15 +24,9 @@ def choose_viewpoints(
     count: int,
     margin: float,
 ) -> list[Viewpoint]:
-    """Cameras spread over the rig, each in the open and with the objects in its picture.
+    """Spread cameras over the rig, each with free sight of the objects.
 
-    Args:
-        loaded: the scene.
-        description: of it.
-        rig: how it is photographed.
-        rng: draws positions.
-        count: how many.
-        margin: part of the rig, on every side, that is left out.
+    ``margin`` is the fraction of the rig that is left out on every side.
     """
     chosen = []
     for position in spread(rng, count, margin):
@@ -52,13 +46,13 @@ def choose_viewpoints(
 
 
 def _probe(viewpoint: Viewpoint) -> Viewpoint:
-    scale = min(1.0, PROBE_SIZE / max(viewpoint.width, viewpoint.height))
+    scale = min(1.0, PROBE_SIZE_PX / max(viewpoint.width, viewpoint.height))
     width, height = (max(1, round(scale * n)) for n in (viewpoint.width, viewpoint.height))
     return replace(viewpoint, width=width, height=height)
 
 
 def _fault(loaded: LoadedScene, description: Description, rig: Rig, viewpoint: Viewpoint) -> float:
-    """How bad a view is: 0 where nothing is near the lens and the objects fill enough of it."""
+    """How bad a view is: 0 if nothing is near the lens and the objects are large enough."""
     depth, is_object = first_hits(loaded, _probe(viewpoint))
     nearest = float(np.nanmin(depth)) if np.isfinite(depth).any() else np.inf
     share = float(is_object.mean())
@@ -68,7 +62,7 @@ def _fault(loaded: LoadedScene, description: Description, rig: Rig, viewpoint: V
 
 
 def exposure(loaded: LoadedScene, viewpoints: list[Viewpoint], rng: np.random.Generator) -> float:
-    """What linear colours are multiplied by, so that little is blown out and little is black."""
+    """Factor on linear colors that avoids overexposure and black."""
     bright = []
     for viewpoint in viewpoints:
         linear = take_photo(loaded, _probe(viewpoint), 16, 0)
@@ -79,6 +73,6 @@ def exposure(loaded: LoadedScene, viewpoints: list[Viewpoint], rng: np.random.Ge
     if not len(values) or values.max() <= 0.0:
         return 1.0
     middle, high = np.percentile(values, [50.0, 95.0])
-    # Middle grey where it may be, as a camera meters, unless that burns out the highlights.
-    grey = 0.18 * float(np.exp(rng.normal(0.0, 0.25)))
-    return float(min(grey / max(middle, 1e-4), 1.1 / max(high, 1e-4)))
+    # Middle gray, as cameras meter, unless highlights would be overexposed.
+    gray = 0.18 * float(np.exp(rng.normal(0.0, 0.25)))
+    return float(min(gray / max(middle, 1e-4), 1.1 / max(high, 1e-4)))

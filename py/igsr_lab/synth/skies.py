@@ -1,4 +1,4 @@
-"""Skies: what shines on a scene from far away, and what stands behind it outdoors.
+"""Skies: distant light and backgrounds.
 
 Each function of ``SKIES`` draws a map of linear RGB radiance, equirectangular [H, W, 3] with the
 zenith in row 0, about as bright as an overcast sky of radiance 1.
@@ -12,12 +12,12 @@ import numpy as np
 
 from igsr_lab.synth.textures import hsv, noise, octaves, to_linear
 
-#: Rows of a map that shows things; it has twice as many columns.
+#: Rows of a detailed map; it has twice the columns.
 ROWS = 256
 
 
 def _directions(rows: int) -> np.ndarray:
-    """[rows, 2 rows, 3]: the unit vector through the center of every pixel."""
+    """Unit vectors through the centers of all pixels, [rows, 2 rows, 3]."""
     polar = (np.arange(rows) + 0.5) / rows * np.pi
     around = (np.arange(2 * rows) + 0.5) / rows * np.pi
     ring = np.sin(polar)[:, None]
@@ -27,19 +27,19 @@ def _directions(rows: int) -> np.ndarray:
 
 
 def _tint(rng: np.random.Generator, strength: float) -> np.ndarray:
-    """[3], mean 1: warm or cold white, at times a colour."""
+    """Warm or cold white, sometimes a color; [3] with mean 1."""
     hue = rng.choice([0.09, 0.6, rng.random()], p=[0.45, 0.45, 0.1])
-    colour = to_linear(hsv(hue, strength * rng.random(), 1.0))
-    return np.asarray(colour / colour.mean())
+    color = to_linear(hsv(hue, strength * rng.random(), 1.0))
+    return np.asarray(color / color.mean())
 
 
 def even(rng: np.random.Generator) -> np.ndarray:
-    """The same light from everywhere."""
+    """The same light from all directions."""
     return np.broadcast_to(_tint(rng, 0.3), (4, 8, 3)).copy()
 
 
 def gradient(rng: np.random.Generator) -> np.ndarray:
-    """From the zenith over the horizon to the ground."""
+    """A gradient from the zenith over the horizon to the ground."""
     up = _directions(32)[..., 2:]
     zenith, horizon = _tint(rng, 0.6), _tint(rng, 0.4)
     ground = 0.4 * rng.random() * _tint(rng, 0.4)
@@ -61,7 +61,7 @@ def cloudy(rng: np.random.Generator) -> np.ndarray:
     azimuth, height = rng.uniform(0, 2 * np.pi), rng.uniform(0.3, 0.95)
     sun = np.array([np.cos(azimuth), np.sin(azimuth), 0.0]) * np.sqrt(1 - height**2)
     sun[2] = height
-    # A disc as wide as haze makes it: a sharp sun would need many more light paths.
+    # The sun is blurred by haze: a sharp one would need many more light paths.
     glow = np.exp((ways @ sun - 1.0) / rng.uniform(0.003, 0.02))
     sky = sky + rng.uniform(5.0, 40.0) * (1.0 - 0.7 * amount[..., None]) * (
         glow[..., None] * to_linear(np.array([1.0, 0.93, 0.82]))
@@ -75,9 +75,9 @@ def _with_hills(rng: np.random.Generator, sky: np.ndarray, up: np.ndarray) -> np
     hue = rng.uniform(0.05, 0.4)
     for step in range(3):
         ridge = 0.16 - 0.07 * step + 0.2 * (octaves(rng, columns, 4, 6)[0] - 0.5)
-        colour = to_linear(hsv(hue + 0.04 * step, 0.25 + 0.15 * step, 0.6 - 0.12 * step))
+        color = to_linear(hsv(hue + 0.04 * step, 0.25 + 0.15 * step, 0.6 - 0.12 * step))
         grain = 0.6 + 0.8 * octaves(rng, columns, 32, 3)[: 2 * len(up) : 2]
-        hill = colour * grain[..., None]
+        hill = color * grain[..., None]
         sky = np.where((up < ridge[None, :])[..., None], hill, sky)
     return sky
 
@@ -101,7 +101,7 @@ def studio(rng: np.random.Generator) -> np.ndarray:
 
 
 def interior(rng: np.random.Generator) -> np.ndarray:
-    """A hall far away: windows, doors, cupboards and lamps as blurred rectangles."""
+    """A distant hall: windows, doors, cupboards and lamps as blurred rectangles."""
     columns = 2 * ROWS
     base = to_linear(hsv(rng.random(), rng.uniform(0.0, 0.35), rng.uniform(0.4, 0.8)))
     picture = base * (0.7 + 0.5 * octaves(rng, columns, 4, 5)[:columns:2])[..., None]
@@ -111,8 +111,8 @@ def interior(rng: np.random.Generator) -> np.ndarray:
         top = rng.integers(int(0.25 * ROWS), int(0.6 * ROWS))
         tall = rng.integers(10, 90)
         bright = rng.choice([0.3, 0.8, 4.0], p=[0.5, 0.35, 0.15])
-        colour = bright * to_linear(hsv(rng.random(), rng.uniform(0, 0.6), rng.uniform(0.3, 1.0)))
-        picture[top : top + tall, np.arange(x, x + wide) % columns] = colour
+        color = bright * to_linear(hsv(rng.random(), rng.uniform(0, 0.6), rng.uniform(0.3, 1.0)))
+        picture[top : top + tall, np.arange(x, x + wide) % columns] = color
     floor = 0.4 * to_linear(hsv(rng.uniform(0.02, 0.15), rng.uniform(0.1, 0.6), 0.7))
     picture[int(0.66 * ROWS) :] = floor
     blur = int(rng.integers(1, 5))
@@ -123,7 +123,7 @@ def interior(rng: np.random.Generator) -> np.ndarray:
     return picture * (0.85 + 0.3 * grain)[..., None]
 
 
-#: Skies for objects before nothing, whose photos do not show them.
+#: Skies for lone objects, whose photos do not show them.
 UNSEEN_SKIES: tuple[Callable[[np.random.Generator], np.ndarray], ...] = (even, gradient, studio)
 #: Skies that photos may show.
 SKIES: tuple[Callable[[np.random.Generator], np.ndarray], ...] = (gradient, cloudy, interior)

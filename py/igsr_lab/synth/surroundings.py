@@ -1,4 +1,4 @@
-"""Whole scenes: objects before nothing, on a table, in a room, outdoors, or on shelves."""
+"""Whole scenes: lone objects, or objects on a table, in a room, outdoors or on shelves."""
 
 from __future__ import annotations
 
@@ -9,19 +9,20 @@ import numpy as np
 from igsr_lab.synth.description import Description, Light, Part
 from igsr_lab.synth.materials import Materials
 from igsr_lab.synth.meshes import Mesh, box, disc, joined, lathe, place, rotation, sheet, tube
-from igsr_lab.synth.objects import OBJECTS, bounds, moved, random_object
+from igsr_lab.synth.objects import OBJECTS, random_object
+from igsr_lab.synth.parts import bounds, moved
 from igsr_lab.synth.skies import SKIES, UNSEEN_SKIES, cloudy
 from igsr_lab.synth.textures import landscape, noise, to_linear
 
-#: Part of the scenes that are of the family "object".
-OBJECT_SHARE = 0.45
-#: Rooms and ground are seldom as colourful as things.
+#: Fraction of the scenes of family "object".
+OBJECT_FRACTION = 0.45
+#: Rooms and ground are less colorful than objects.
 ROOM_VIVIDNESS = 0.1
 
 
 def draw_description(rng: np.random.Generator) -> Description:
-    """A random scene of one of the two families."""
-    if rng.random() < OBJECT_SHARE:
+    """Draw a scene of one of the two families."""
+    if rng.random() < OBJECT_FRACTION:
         return _lone_object(rng)
     kinds = (_table, _room, _outdoors, _corner, _shelves)
     return kinds[rng.integers(len(kinds))](rng)
@@ -33,7 +34,7 @@ def _turned(rng: np.random.Generator, parts: list[Part], size: float, at: np.nda
 
 
 def _cluster(rng: np.random.Generator, count: int) -> tuple[list[str], list[Part]]:
-    """Objects side by side on z = 0 within a circle of radius 1 or a little more."""
+    """Objects next to each other on z = 0, within a circle of radius about 1."""
     names: list[str] = []
     parts: list[Part] = []
     taken: list[tuple[np.ndarray, float]] = []
@@ -52,10 +53,10 @@ def _cluster(rng: np.random.Generator, count: int) -> tuple[list[str], list[Part
     return names, parts
 
 
-def _lamps(rng: np.random.Generator, most: int, reach: float, power: float) -> list[Light]:
-    """Area lights high above, outside the cameras' way."""
+def _lamps(rng: np.random.Generator, reach: float, power: float) -> list[Light]:
+    """At most two area lights high above the cameras."""
     lamps = []
-    for _ in range(int(rng.integers(0, most + 1))):
+    for _ in range(int(rng.integers(0, 3))):
         azimuth, height = rng.uniform(0, 2 * math.pi), rng.uniform(0.75, 0.95)
         ring = math.sqrt(1.0 - height**2)
         way = np.array([ring * math.cos(azimuth), ring * math.sin(azimuth), height])
@@ -76,7 +77,7 @@ def _lamps(rng: np.random.Generator, most: int, reach: float, power: float) -> l
 
 
 def _framed(description: Description) -> Description:
-    """The description with ``center`` and ``radius`` of its objects."""
+    """Set ``center`` and ``radius`` by the objects."""
     lowest, highest = bounds(description.objects)
     description.center = 0.5 * (lowest + highest)
     description.radius = max(
@@ -100,13 +101,11 @@ def _lone_object(rng: np.random.Generator) -> Description:
             plate = place(joined(box((2 * reach, 2 * reach, 0.1))), (0, 0, -0.1))
             parts.append(Part(plate, base, smooth=False))
     sky = UNSEEN_SKIES[rng.integers(len(UNSEEN_SKIES))](rng)
-    return _framed(
-        Description("object", "none", names, parts, sky, lights=_lamps(rng, 2, 6.0, 1.2))
-    )
+    return _framed(Description("object", "none", names, parts, sky, lights=_lamps(rng, 6.0, 1.2)))
 
 
 def _upright(wide: float, tall: float, off: float, along: float, foot: float) -> Mesh:
-    """A rectangle across the x axis at ``off``, about y = ``along``, from ``foot`` up."""
+    """A rectangle across the x axis at ``off``, around y = ``along``, from ``foot`` up."""
     vertices, faces, uv = sheet(wide, tall)
     return vertices[:, [2, 0, 1]] + [off, along, foot + 0.5 * tall], faces, uv
 
@@ -119,8 +118,8 @@ def _walls(
     Args:
         rng: draws the textures.
         materials: of the room.
-        floor: its height.
-        sides: the distance of the wall from the origin for each side, 0 to 3 for +x, +y, -x, -y.
+        floor: height of the floor.
+        sides: distances of the walls from the origin by side, 0 to 3 for +x, +y, -x, -y.
     """
     reach = 2.2 * max(2.5, *sides.values())
     height = float(rng.uniform(0.4, 0.6)) * reach
@@ -157,9 +156,9 @@ def _walls(
 
 
 def _ceiling(rng: np.random.Generator, room: float, parts: list[Part]) -> list[Light]:
-    """A shining ceiling as large as the room, and at times a lamp below it.
+    """A luminous ceiling as large as the room, and sometimes a lamp below it.
 
-    A sky over open walls would light the room too, but most light paths to it would end in a wall.
+    Most light paths to a sky above open walls would end at a wall.
     """
     height = 0.99 * float(bounds(parts)[1][2])
     tint = to_linear(np.array([1.0, *rng.uniform(0.85, 1.0, 2)]))
@@ -179,7 +178,7 @@ def _bystanders(
     floor: float,
     sizes: tuple[float, float],
 ) -> list[Part]:
-    """Objects around the scene, between two distances from its middle."""
+    """Objects around the scene, between two distances from the origin."""
     parts: list[Part] = []
     for _ in range(count):
         _, made = random_object(rng)
@@ -212,7 +211,7 @@ def _table(rng: np.random.Generator) -> Description:
         ]
         parts.append(Part(joined(legs), materials.plain()))
     sky: np.ndarray | None = SKIES[rng.integers(len(SKIES))](rng)
-    lamps = _lamps(rng, 2, 7.0, 1.0)
+    lamps = _lamps(rng, 7.0, 1.0)
     room = np.inf
     if rng.random() < 0.6:
         room = float(rng.uniform(4.0, 6.0))
@@ -249,7 +248,7 @@ def _outdoors(rng: np.random.Generator) -> Description:
     size, cells = 36.0, 96
     heights = rng.uniform(0.5, 3.0) * (noise(rng, cells, cells, (8, 8)) - 0.5)
     x, y = np.meshgrid(np.linspace(-1, 1, cells), np.linspace(-1, 1, cells))
-    # Level where the objects and cameras are.
+    # Level near the objects and cameras.
     heights *= np.clip((np.hypot(x, y) - 0.2) * 3.0, 0.0, 1.0)
     vertices, faces, uv = sheet(size, size, heights)
     earth = materials.textured("grass", "grass", "stone", "cells", "bricks", "tiles")
@@ -264,7 +263,7 @@ def _outdoors(rng: np.random.Generator) -> Description:
 
 
 def _corner(rng: np.random.Generator) -> Description:
-    """Objects or plants before one or two walls, seen from the open side."""
+    """Objects or plants at one or two walls, seen from the open side."""
     names, objects = _cluster(rng, int(rng.integers(2, 6)))
     if rng.random() < 0.4:
         for _ in range(int(rng.integers(1, 4))):
@@ -289,14 +288,14 @@ def _corner(rng: np.random.Generator) -> Description:
             objects,
             sky,
             parts,
-            _lamps(rng, 2, 6.0, 1.0),
+            _lamps(rng, 6.0, 1.0),
             open_towards=open_towards,
         )
     )
 
 
 def _shelves(rng: np.random.Generator) -> Description:
-    """Rows of objects on boards before a wall, seen from the front (the side of -x)."""
+    """Rows of objects on boards at a wall, seen from -x."""
     materials = Materials(rng, ROOM_VIVIDNESS)
     wide, deep = float(rng.uniform(2.2, 3.6)), float(rng.uniform(0.6, 0.9))
     boards, gap = int(rng.integers(1, 4)), float(rng.uniform(0.8, 1.1))
@@ -333,7 +332,7 @@ def _shelves(rng: np.random.Generator) -> Description:
             objects,
             sky,
             parts,
-            _lamps(rng, 2, 7.0, 1.0),
+            _lamps(rng, 7.0, 1.0),
             open_towards=math.pi,
         )
     )

@@ -1,4 +1,4 @@
-"""Textures made with numpy: sRGB in [0, 1], float64 [H, W, 3]; most of them repeat at the edges."""
+"""Random textures: sRGB in [0, 1], float64 [H, W, 3]; most are seamless."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 
 def noise(rng: np.random.Generator, height: int, width: int, cells: tuple[int, int]) -> np.ndarray:
-    """Smooth noise in [0,1] that repeats at the edges: cosine-blended random values."""
+    """Smooth seamless noise in [0, 1]: cosine-blended random values."""
     grid = rng.random(cells)
     rows = np.arange(height) / height * cells[0]
     columns = np.arange(width) / width * cells[1]
@@ -29,12 +29,12 @@ def mix(a: Any, b: Any, amount: np.ndarray) -> np.ndarray:
 
 
 def to_linear(srgb: np.ndarray) -> np.ndarray:
-    """sRGB in [0, 1] as linear light (IEC 61966-2-1)."""
+    """Convert sRGB in [0, 1] to linear light (IEC 61966-2-1)."""
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def to_srgb(linear: np.ndarray) -> np.ndarray:
-    """Linear light in [0, 1] as sRGB (IEC 61966-2-1)."""
+    """Convert linear light in [0, 1] to sRGB (IEC 61966-2-1)."""
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
@@ -45,38 +45,36 @@ def hsv(hue: float, saturation: float, value: float) -> np.ndarray:
 
 
 def palette(rng: np.random.Generator, vividness: float) -> np.ndarray:
-    """[8, 3] sRGB colours that could stand side by side: one or two hues, neutrals, an accent.
+    """Draw matching sRGB colors, [8, 3]: one or two hues, neutrals, an accent.
 
-    Args:
-        rng: draws them.
-        vividness: the probability that all but the neutrals are saturated.
+    ``vividness`` is the probability that all except the neutrals are saturated.
     """
     hue = rng.random()
     second = hue + rng.choice([0.05, -0.08, 0.33, 0.5])
     vivid = rng.random() < vividness
-    colours = []
+    colors = []
     for index in range(8):
         if index < 2:
             warmth = rng.choice([0.09, 0.6])
-            colours.append(hsv(warmth, rng.uniform(0.0, 0.2), rng.uniform(0.2, 0.95)))
+            colors.append(hsv(warmth, rng.uniform(0.0, 0.2), rng.uniform(0.2, 0.95)))
             continue
         base = hue if index < 5 else second if index < 7 else rng.random()
         saturation = rng.uniform(0.5, 0.95) if vivid or index == 7 else rng.uniform(0.05, 0.5)
-        colours.append(hsv(base + rng.normal(0.0, 0.03), saturation, rng.uniform(0.2, 1.0) ** 0.7))
-    return np.array(colours)
+        colors.append(hsv(base + rng.normal(0.0, 0.03), saturation, rng.uniform(0.2, 1.0) ** 0.7))
+    return np.array(colors)
 
 
 def octaves(
     rng: np.random.Generator, size: int, cells: int, levels: int = 4, stretch: int = 1
 ) -> np.ndarray:
-    """[size, size] in [0, 1]: noise of ``cells`` cells and finer ones, each at half the weight.
+    """Sum of noises, [size, size] in [0, 1], each of half the weight and twice the cells.
 
     Args:
-        rng: draws it.
+        rng: draws the noise.
         size: rows and columns.
         cells: of the coarsest noise, along u.
-        levels: how many noises, each of twice the cells.
-        stretch: how many times more cells along v than along u.
+        levels: number of noises.
+        stretch: ratio of cells along v to cells along u.
     """
     total, weight, amount = np.zeros((size, size)), 0.0, 1.0
     for _ in range(levels):
@@ -89,8 +87,8 @@ def octaves(
     return (total - low) / max(high - low, 1e-9)
 
 
-def _pick(rng: np.random.Generator, colours: np.ndarray, count: int) -> np.ndarray:
-    return colours[rng.choice(len(colours), count, replace=False)]
+def _pick(rng: np.random.Generator, colors: np.ndarray, count: int) -> np.ndarray:
+    return colors[rng.choice(len(colors), count, replace=False)]
 
 
 def _grid(size: int) -> tuple[np.ndarray, np.ndarray]:
@@ -101,22 +99,22 @@ def _grid(size: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _worn(rng: np.random.Generator, picture: np.ndarray, amount: float) -> np.ndarray:
-    """The picture with blotches of dirt and fading, so that no surface is a single flat colour."""
+    """Add blotches of dirt, so that no surface is a single flat color."""
     size = len(picture)
     blotches = octaves(rng, size, int(rng.integers(2, 8)), 5)
     return np.clip(picture * (1.0 - amount * blotches[..., None]), 0.0, 1.0)
 
 
-def speckle(rng: np.random.Generator, colours: np.ndarray, size: int) -> np.ndarray:
-    """One colour, unevenly applied, with fine grain."""
-    (base,) = _pick(rng, colours, 1)
+def speckle(rng: np.random.Generator, colors: np.ndarray, size: int) -> np.ndarray:
+    """One color, unevenly applied, with fine grain."""
+    (base,) = _pick(rng, colors, 1)
     grain = noise(rng, size, size, (size // 2, size // 2))
     return _worn(rng, base * (1.0 - 0.12 * grain[..., None]), rng.uniform(0.1, 0.35))
 
 
-def clouds(rng: np.random.Generator, colours: np.ndarray, size: int) -> np.ndarray:
-    """Three colours that run into each other."""
-    a, b, c = _pick(rng, colours, 3)
+def clouds(rng: np.random.Generator, colors: np.ndarray, size: int) -> np.ndarray:
+    """Three colors that run into each other."""
+    a, b, c = _pick(rng, colors, 3)
     first = octaves(rng, size, int(rng.integers(2, 7)), 5)
     second = octaves(rng, size, int(rng.integers(2, 7)), 5)
     sharp = rng.uniform(1.0, 6.0)
@@ -124,42 +122,42 @@ def clouds(rng: np.random.Generator, colours: np.ndarray, size: int) -> np.ndarr
     return mix(mix(a, b, blend), c, np.clip((second - 0.55) * sharp, 0.0, 1.0))
 
 
-def checker(rng: np.random.Generator, colours: np.ndarray, size: int) -> np.ndarray:
-    """Squares of two colours."""
-    a, b = _pick(rng, colours, 2)
+def checker(rng: np.random.Generator, colors: np.ndarray, size: int) -> np.ndarray:
+    """Squares of two colors."""
+    a, b = _pick(rng, colors, 2)
     u, v = _grid(size)
     squares = 2 * int(rng.integers(2, 8))
     odd = ((u * squares).astype(int) + (v * squares).astype(int)) % 2
     return _worn(rng, mix(a, b, odd), rng.uniform(0.0, 0.3))
 
 
-def stripes(rng: np.random.Generator, colours: np.ndarray, size: int) -> np.ndarray:
+def stripes(rng: np.random.Generator, colors: np.ndarray, size: int) -> np.ndarray:
     """Bands of random widths, straight, slanted or wavy."""
     u, v = _grid(size)
     if rng.random() < 0.5:
         u, v = v, u
-    bands = colours[rng.integers(0, len(colours), int(rng.integers(4, 20)))]
+    bands = colors[rng.integers(0, len(colors), int(rng.integers(4, 20)))]
     edges = np.sort(rng.random(len(bands) - 1))
     wave = rng.choice([0.0, 0.0, 0.04]) * np.sin(2 * np.pi * int(rng.integers(1, 4)) * u)
     at = (v * int(rng.integers(1, 4)) + int(rng.integers(0, 2)) * u + wave) % 1.0
     return _worn(rng, bands[np.searchsorted(edges, at)], rng.uniform(0.0, 0.25))
 
 
-def plaid(rng: np.random.Generator, colours: np.ndarray, size: int) -> np.ndarray:
+def plaid(rng: np.random.Generator, colors: np.ndarray, size: int) -> np.ndarray:
     """Stripes both ways, woven."""
-    across, along = stripes(rng, colours, size), stripes(rng, colours, size)
+    across, along = stripes(rng, colors, size), stripes(rng, colors, size)
     u, v = _grid(size)
     over = (np.sin(2 * np.pi * 64 * u) * np.sin(2 * np.pi * 64 * v) > 0.0) * 0.3 + 0.35
     return mix(across, along.transpose(1, 0, 2), over)
 
 
-def dots(rng: np.random.Generator, colours: np.ndarray, size: int) -> np.ndarray:
-    """Dots or rings in rows, each of a colour of its own."""
-    ground = _pick(rng, colours, 1)[0]
+def dots(rng: np.random.Generator, colors: np.ndarray, size: int) -> np.ndarray:
+    """Dots or rings in rows, in several colors."""
+    ground = _pick(rng, colors, 1)[0]
     count = int(rng.integers(3, 12))
     u, v = _grid(size)
     radius = np.hypot((u * count) % 1 - 0.5, (v * count) % 1 - 0.5)
-    paint = colours[rng.integers(0, len(colours), (count, count))]
+    paint = colors[rng.integers(0, len(colors), (count, count))]
     own = paint[(v * count).astype(int), (u * count).astype(int)]
     outer = rng.uniform(0.2, 0.48)
     ring = (radius < outer) & (radius > outer * rng.choice([0.0, 0.0, 0.6]))
@@ -167,12 +165,12 @@ def dots(rng: np.random.Generator, colours: np.ndarray, size: int) -> np.ndarray
     return _worn(rng, picture, rng.uniform(0.0, 0.25))
 
 
-def wood(rng: np.random.Generator, colours: np.ndarray, size: int) -> np.ndarray:
+def wood(rng: np.random.Generator, colors: np.ndarray, size: int) -> np.ndarray:
     """Planks with grain along u, in a brown or a stain of the palette."""
     dark = hsv(rng.uniform(0.04, 0.1), rng.uniform(0.4, 0.75), rng.uniform(0.15, 0.5))
     light = np.clip(dark * rng.uniform(1.4, 2.2) + 0.08, 0.0, 1.0)
     if rng.random() < 0.2:
-        dark, light = sorted(_pick(rng, colours, 2), key=lambda colour: float(colour.sum()))
+        dark, light = sorted(_pick(rng, colors, 2), key=lambda color: float(color.sum()))
     planks = int(rng.integers(1, 9))
     _, v = _grid(size)
     plank = (v * planks).astype(int)
@@ -187,9 +185,9 @@ def wood(rng: np.random.Generator, colours: np.ndarray, size: int) -> np.ndarray
     return picture
 
 
-def marble(rng: np.random.Generator, colours: np.ndarray, size: int) -> np.ndarray:
+def marble(rng: np.random.Generator, colors: np.ndarray, size: int) -> np.ndarray:
     """Veins through stone."""
-    a, b = _pick(rng, colours, 2)
+    a, b = _pick(rng, colors, 2)
     a = 0.4 * a + 0.6 * rng.uniform(0.1, 0.95)
     u, v = _grid(size)
     warp = octaves(rng, size, 3, 6)
@@ -197,9 +195,9 @@ def marble(rng: np.random.Generator, colours: np.ndarray, size: int) -> np.ndarr
     return mix(b, a, np.clip(vein ** rng.uniform(0.3, 0.8) + 0.2 * warp, 0.0, 1.0))
 
 
-def stone(rng: np.random.Generator, colours: np.ndarray, size: int) -> np.ndarray:
-    """Granite, concrete, gravel: a grey with grains of other tones."""
-    base = 0.3 * _pick(rng, colours, 1)[0] + 0.7 * rng.uniform(0.25, 0.8)
+def stone(rng: np.random.Generator, colors: np.ndarray, size: int) -> np.ndarray:
+    """Granite, concrete, gravel: a gray with grains of other tones."""
+    base = 0.3 * _pick(rng, colors, 1)[0] + 0.7 * rng.uniform(0.25, 0.8)
     picture = np.broadcast_to(base, (size, size, 3)).copy()
     for _ in range(3):
         cells = int(rng.integers(24, size // 2))
@@ -208,11 +206,11 @@ def stone(rng: np.random.Generator, colours: np.ndarray, size: int) -> np.ndarra
     return _worn(rng, np.clip(picture, 0.0, 1.0), rng.uniform(0.2, 0.5))
 
 
-def bricks(rng: np.random.Generator, colours: np.ndarray, size: int) -> np.ndarray:
+def bricks(rng: np.random.Generator, colors: np.ndarray, size: int) -> np.ndarray:
     """A wall in running bond, each brick with its own tone."""
     base = hsv(rng.uniform(0.0, 0.1), rng.uniform(0.3, 0.7), rng.uniform(0.35, 0.8))
     if rng.random() < 0.3:
-        base = _pick(rng, colours, 1)[0]
+        base = _pick(rng, colors, 1)[0]
     rows, columns = 2 * int(rng.integers(3, 9)), int(rng.integers(2, 7))
     u, v = _grid(size)
     row = (v * rows).astype(int)
@@ -228,25 +226,25 @@ def bricks(rng: np.random.Generator, colours: np.ndarray, size: int) -> np.ndarr
     return np.clip(picture, 0.0, 1.0)
 
 
-def tiles(rng: np.random.Generator, colours: np.ndarray, size: int) -> np.ndarray:
-    """Square tiles with joints; plain, of several colours, or each with an ornament."""
+def tiles(rng: np.random.Generator, colors: np.ndarray, size: int) -> np.ndarray:
+    """Square tiles with joints; plain, of several colors, or each with an ornament."""
     count = int(rng.integers(3, 9))
     u, v = _grid(size)
     x, y = (u * count) % 1 - 0.5, (v * count) % 1 - 0.5
     row, column = (v * count).astype(int), (u * count).astype(int)
-    few = _pick(rng, colours, int(rng.integers(2, 5)))
+    few = _pick(rng, colors, int(rng.integers(2, 5)))
     picture = few[rng.integers(0, len(few), (count, count))][row, column]
     if rng.random() < 0.5:
         petals, radius, angle = int(rng.integers(3, 9)), np.hypot(x, y), np.arctan2(y, x)
         ornament = radius < 0.28 + 0.14 * np.cos(petals * angle)
-        picture[ornament] = _pick(rng, colours, 1)[0]
+        picture[ornament] = _pick(rng, colors, 1)[0]
         picture[radius < 0.1] = few[0]
     picture *= rng.uniform(0.85, 1.0, (count, count))[row, column][..., None]
     picture[0.5 - np.maximum(np.abs(x), np.abs(y)) < 0.025] = rng.uniform(0.2, 0.9)
     return _worn(rng, picture, rng.uniform(0.0, 0.3))
 
 
-def cells(rng: np.random.Generator, colours: np.ndarray, size: int) -> np.ndarray:
+def cells(rng: np.random.Generator, colors: np.ndarray, size: int) -> np.ndarray:
     """Crazy paving, scales or mosaic: the cells of random points, with joints (Worley 1996)."""
     count = int(rng.integers(12, 70))
     points = rng.random((count, 2))
@@ -261,23 +259,23 @@ def cells(rng: np.random.Generator, colours: np.ndarray, size: int) -> np.ndarra
         second = np.where(closer, nearest, np.minimum(second, distance))
         owner[closer] = index
         nearest = np.where(closer, distance, nearest)
-    few = _pick(rng, colours, 3)
+    few = _pick(rng, colors, 3)
     paint = few[rng.integers(0, len(few), count)] * rng.uniform(0.6, 1.1, (count, 1))
     picture = paint[owner] * (0.8 + 0.2 * octaves(rng, size, 8, 4))[..., None]
     picture[second - nearest < rng.uniform(0.004, 0.015)] *= 0.35
     return np.clip(picture, 0.0, 1.0)
 
 
-def rust(rng: np.random.Generator, colours: np.ndarray, size: int) -> np.ndarray:
+def rust(rng: np.random.Generator, colors: np.ndarray, size: int) -> np.ndarray:
     """Paint that has come off in places."""
-    paint = _pick(rng, colours, 1)[0]
+    paint = _pick(rng, colors, 1)[0]
     patches = octaves(rng, size, int(rng.integers(3, 7)), 6)
     brown = mix([0.25, 0.11, 0.05], [0.6, 0.31, 0.13], octaves(rng, size, 16, 4))
     bare = np.clip((patches - rng.uniform(0.5, 0.75)) * 20.0, 0.0, 1.0)
     return mix(_worn(rng, np.broadcast_to(paint, (size, size, 3)), 0.25), brown, bare)
 
 
-def grass(rng: np.random.Generator, colours: np.ndarray, size: int) -> np.ndarray:
+def grass(rng: np.random.Generator, colors: np.ndarray, size: int) -> np.ndarray:
     """Lawn, moss or dry ground: fine streaks in greens and browns."""
     hue = rng.uniform(0.1, 0.36)
     dark, light = hsv(hue, 0.7, 0.18), hsv(hue - 0.04, 0.55, 0.7)
@@ -285,13 +283,13 @@ def grass(rng: np.random.Generator, colours: np.ndarray, size: int) -> np.ndarra
     blades = 0.5 * fine + 0.5 * octaves(rng, size, 24, 3)
     picture = mix(dark, light, np.clip(1.8 * (blades - 0.5) + 0.45, 0.0, 1.0))
     bare = np.clip((octaves(rng, size, 4, 4) - 0.6) * 5.0, 0.0, 1.0)
-    earth = 0.5 * _pick(rng, colours, 1)[0] + 0.5 * np.array([0.38, 0.28, 0.18])
+    earth = 0.5 * _pick(rng, colors, 1)[0] + 0.5 * np.array([0.38, 0.28, 0.18])
     return mix(picture, earth * (0.6 + 0.5 * fine[..., None]), bare)
 
 
-def printed(rng: np.random.Generator, colours: np.ndarray, size: int) -> np.ndarray:
+def printed(rng: np.random.Generator, colors: np.ndarray, size: int) -> np.ndarray:
     """A cover, a label or a page: words, rules and a roundel in the font that Pillow brings."""
-    few = _pick(rng, colours, 3)
+    few = _pick(rng, colors, 3)
     image = Image.new("RGB", (size, size), _eight_bit(few[0]))
     draw = ImageDraw.Draw(image)
     if rng.random() < 0.5:
@@ -320,13 +318,13 @@ def printed(rng: np.random.Generator, colours: np.ndarray, size: int) -> np.ndar
     return _worn(rng, np.asarray(image) / 255.0, rng.uniform(0.0, 0.2))
 
 
-def _eight_bit(colour: np.ndarray) -> tuple[int, int, int]:
-    red, green, blue = (round(255 * float(channel)) for channel in np.clip(colour, 0, 1))
+def _eight_bit(color: np.ndarray) -> tuple[int, int, int]:
+    red, green, blue = (round(255 * float(channel)) for channel in np.clip(color, 0, 1))
     return red, green, blue
 
 
 def leaf_veins(rng: np.random.Generator, size: int) -> np.ndarray:
-    """A leaf's blade along u with its midrib at v = 1/2; greens, yellows and reds."""
+    """A leaf along u with its midrib at v = 1/2; greens, yellows and reds."""
     hue = rng.choice([rng.uniform(0.2, 0.4), rng.uniform(0.2, 0.4), rng.uniform(-0.03, 0.16)])
     dark, light = hsv(hue, rng.uniform(0.5, 0.9), rng.uniform(0.15, 0.5)), hsv(hue - 0.04, 0.5, 0.8)
     u, v = _grid(size)
@@ -338,7 +336,7 @@ def leaf_veins(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def landscape(rng: np.random.Generator, size: int) -> np.ndarray:
-    """A picture for a frame on a wall: hills one behind the other under a sky; row 0 is below."""
+    """A picture for a wall: hills under a sky; row 0 is at the bottom."""
     u, v = _grid(size)
     sky, low = hsv(rng.random(), rng.uniform(0.2, 0.6), 0.9), hsv(rng.random(), 0.3, 0.95)
     picture = mix(low, sky, v)

@@ -1,4 +1,4 @@
-"""The study ``denoiser-table``: the same renders before and after, and scores that are right."""
+"""Study ``denoiser_table``: renders of degraded fits before and after denoising."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from igsr.denoiser.network import DenoiserNetwork
 from igsr.denoiser.weights import save_network
 from igsr.fitting import presets
 from igsr_lab.denoiser.pair_files import Pairs, write_pairs
-from igsr_lab.study import degraded_fits, denoiser_comparison, denoiser_table
+from igsr_lab.study import Study, degraded_fits, denoiser_study, denoiser_table
 from igsr_lab.study.cleaned_renders import SCORES, Cleaning, run_cleaning
 from igsr_lab.study.degraded_fits import DegradedFit, degraded_capture, scenes_in
 
@@ -27,7 +27,7 @@ SMALL = Architecture(4, (1, 0, 0))
 
 
 def weights(path, brighter=0.0, log_error=-3.0):
-    """A denoiser that adds ``brighter`` to every colour and expects the same error everywhere."""
+    """A denoiser that adds ``brighter`` to every color and expects the same error everywhere."""
     network = DenoiserNetwork(SMALL)
     with torch.no_grad():
         # Before pixel shuffle each output has four channels; the offset of log errors is -3.
@@ -55,46 +55,46 @@ def test_a_denoiser_that_does_nothing_changes_no_score(tmp_path):
     file = pairs(tmp_path / "pairs.npz")
     before = run_cleaning("", Cleaning(file, None, None))
     same = run_cleaning("", Cleaning(file, weights(tmp_path / "same.safetensors"), None))
-    half = np.square(20 / 255) / 2
-    assert before["psnr"] == pytest.approx(-10 * np.log10(half))
+    assert before["psnr"] == pytest.approx(-10 * np.log10(np.square(20 / 255) / 2))
     assert before["best_quarter"] == 100.0
     assert before["perceptual"] is None
     for name in SCORES:
         assert same[name] == before[name]
     found = same["confidence"]
     assert found["mean_error"] == pytest.approx(10 / 255, rel=1e-5)
-    assert found["weighted_error"] == pytest.approx(10 / 255, rel=1e-5), "all weigh the same"
+    assert found["weighted_error"] == pytest.approx(10 / 255, rel=1e-5)
     claimed = 0.05 / (0.05 + np.exp(-3.0))
     assert sum(found["confidence"]) / sum(found["pixels"]) == pytest.approx(claimed, rel=1e-2)
 
 
-def test_what_was_right_counts_as_the_best_quarter(tmp_path):
+def test_the_best_quarter_shows_harm_to_good_pixels(tmp_path):
     file = pairs(tmp_path / "pairs.npz")
-    # Sure of itself, so that all of the change is made.
+    # A confident denoiser makes all of its change: good pixels become 10 too bright.
     brighter = weights(tmp_path / "brighter.safetensors", brighter=10.2 / 255, log_error=-7.0)
     after = run_cleaning("", Cleaning(file, brighter, None))
-    # Right pixels become 10 too bright, wrong ones stay 10 too dark.
-    assert after["psnr"] == pytest.approx(-20 * np.log10(10 / 255), abs=0.05)
-    assert after["best_quarter"] == pytest.approx(-20 * np.log10(10 / 255), abs=0.05)
+    for name in ("psnr", "best_quarter"):
+        assert after[name] == pytest.approx(-20 * np.log10(10 / 255), abs=0.05)
 
 
-def test_hidden_pixels_count_nowhere(tmp_path):
+def test_hidden_pixels_do_not_count(tmp_path):
     file = pairs(tmp_path / "pairs.npz", hidden=24)
     before = run_cleaning("", Cleaning(file, None, None))
-    assert before["psnr"] == pytest.approx(-20 * np.log10(20 / 255))
-    assert before["best_quarter"] == pytest.approx(-20 * np.log10(20 / 255))
+    for name in ("psnr", "best_quarter"):
+        assert before[name] == pytest.approx(-20 * np.log10(20 / 255))
     same = run_cleaning("", Cleaning(file, weights(tmp_path / "same.safetensors"), None))
     assert sum(same["confidence"]["pixels"]) == 2 * 40 * 24
 
 
-def test_views_of_degraded_fits():
+def test_photos_of_degraded_fits():
     made = scenes.capture(views=40, size=16)
-    few = degraded_capture(made, DegradedFit("ball", "3", 0, "cpu"))
-    assert [view.name for view in few.train_views] == [
-        made.train_views[i].name for i in (0, 14, 29)
-    ]
+
+    def degraded(kind, seed=0, capture=made, scene="ball"):
+        return degraded_capture(capture, DegradedFit(scene, kind, seed, "cpu"))
+
+    few, noisy, paper = degraded("3"), degraded("noise"), degraded("paper")
+    expected = [made.train_views[i].name for i in (0, 14, 29)]
+    assert [view.name for view in few.train_views] == expected
     assert len(few.test_views) == 8, "of ten"
-    noisy = degraded_capture(made, DegradedFit("ball", "noise", 0, "cpu"))
     assert len(noisy.train_views) == 20
     assert noisy.points is None
     by_name = {view.name: view for view in made.views}
@@ -102,20 +102,16 @@ def test_views_of_degraded_fits():
         assert not np.allclose(view.camera.viewmat, by_name[view.name].camera.viewmat, atol=1e-4)
     for view in noisy.test_views:
         assert np.array_equal(view.camera.viewmat, by_name[view.name].camera.viewmat)
-    again = degraded_capture(made, DegradedFit("ball", "noise", 0, "cpu"))
-    other = degraded_capture(made, DegradedFit("ball", "noise", 1, "cpu"))
-    paper = degraded_capture(made, DegradedFit("ball", "paper", 0, "cpu"))
     K = paper.train_views[0].camera.K
-    assert abs(K[0, 0] / K[1, 1] - 1.0) > 1e-3, "stretched as it comes"
-    first = noisy.train_views[0].camera.viewmat
-    assert np.array_equal(first, again.train_views[0].camera.viewmat)
-    assert not np.array_equal(first, other.train_views[0].camera.viewmat)
+    assert abs(K[0, 0] / K[1, 1] - 1.0) > 1e-3, "affine noise is kept"
+    other = degraded("noise", seed=1).train_views[0].camera.viewmat
+    assert not np.array_equal(noisy.train_views[0].camera.viewmat, other)
 
     whole = Capture(made.path, [replace(view, split="train") for view in made.views])
-    assert len(degraded_capture(whole, DegradedFit("leaf", "6", 0, "cpu")).train_views) == 6
-    assert len(degraded_capture(whole, DegradedFit("leaf", "noise", 0, "cpu")).train_views) == 20
+    assert len(degraded("6", capture=whole, scene="leaf").train_views) == 6
+    assert len(degraded("noise", capture=whole, scene="leaf").train_views) == 20
     with pytest.raises(igsr.IgsrError, match="has 3 photos to fit, not 6"):
-        degraded_capture(scenes.capture(views=4, size=16), DegradedFit("ball", "6", 0, "cpu"))
+        degraded("6", capture=scenes.capture(views=4, size=16))
 
 
 @pytest.fixture
@@ -126,81 +122,74 @@ def data(tmp_path):
     return tmp_path / "data"
 
 
-def test_photos_in_a_folder_of_their_own_are_no_further_scene(tmp_path):
-    for name in ("leaf", "stone"):
-        (tmp_path / name / "images").mkdir(parents=True)
-        capture_files.write_transforms(tmp_path / name)
-    assert scenes_in(tmp_path) == ("leaf", "stone")
-
-
-def test_the_study(data, tmp_path, monkeypatch, lab_here):
+def test_images_of_a_capture_are_not_another_scene(data, tmp_path):
     assert scenes_in(data) == ("ball", "more/cube")
-    short = replace(presets.settings_for("default", 8), steps=20, max_splats=200)
+    for name in ("leaf", "stone"):
+        (tmp_path / "two" / name / "images").mkdir(parents=True)
+        capture_files.write_transforms(tmp_path / "two" / name)
+    assert scenes_in(tmp_path / "two") == ("leaf", "stone")
+    with pytest.raises(igsr.IgsrError, match="holds no folder of photos with cameras"):
+        scenes_in(data / "empty")
+
+
+def test_denoisers_are_compared_and_other_weights_are_scored_again(
+    data, tmp_path, monkeypatch, lab_here
+):
+    short = replace(presets.settings_for(8), steps=20, max_splats=200)
     monkeypatch.setattr(presets, "_default", lambda *_: short)
-    monkeypatch.setattr(denoiser_comparison, "SHIPPED", tmp_path / "same.safetensors")
+    monkeypatch.setattr(denoiser_study, "SHIPPED", tmp_path / "same.safetensors")
     weights(tmp_path / "same.safetensors")
     dark = weights(tmp_path / "dark.safetensors", brighter=-0.2)
-    study = ["study", "denoiser-table", data, "--out", tmp_path / "out", "--kind", "3"]
-    study += ["--denoiser", f"dark={dark}", "--json", "--backend", "cpu"]
-    done = lab_here(*study, "--kind", "noise")
+    command = ["study", "denoiser-table", data, "--out", tmp_path / "out", "--kind", "3"]
+    command += ["--denoiser", f"dark={dark}", "--json", "--backend", "cpu"]
+    refused = lab_here(*command, "--denoiser", "mine")
+    assert refused.returncode == 1
+    assert "--denoiser must be NAME=FILE, each name once, not 'mine'" in refused.stderr
+    done = lab_here(*command, "--kind", "noise")
     assert done.returncode == 0, done.stderr
     assert "4 of 4: more/cube noise seed 0: 1 renders" in done.stderr
     report = json.loads(done.stdout)
     assert report == json.loads((tmp_path / "out/study.json").read_text())
-    ball = report["scenes"]["ball"]
+    ball, cube = (report["scenes"][name] for name in ("ball", "cube"))
     assert ball["after"] == ball["before"]
     assert ball["others"]["dark"]["psnr"] < ball["before"]["psnr"]
     of_kinds = [ball["kinds"][kind]["before"]["psnr"] for kind in ("3", "noise")]
     assert ball["before"]["psnr"] == pytest.approx(np.mean(of_kinds))
-    assert report["mean"]["noise"]["before"]["psnr"] == pytest.approx(
-        np.mean(
-            [
-                report["scenes"][name]["kinds"]["noise"]["before"]["psnr"]
-                for name in ("ball", "cube")
-            ]
-        )
-    )
+    noise = [scene["kinds"]["noise"]["before"]["psnr"] for scene in (ball, cube)]
+    assert report["mean"]["noise"]["before"]["psnr"] == pytest.approx(np.mean(noise))
     assert "| ball | 3 | dark |" in (tmp_path / "out/study.md").read_text()
     for picture in ("study.png", "confidence.png", "ball.png", "cube.png"):
         assert (tmp_path / "out" / picture).stat().st_size > 1000
 
-    def again(*arguments):
-        raise AssertionError("fitted again")
-
-    monkeypatch.setattr(denoiser_comparison, "run_fit", again)
     weights(tmp_path / "same.safetensors", brighter=0.1)
     pairs(tmp_path / "pairs/a-sparse-0.npz")
     (tmp_path / "pairs/.b-sparse-0.npz.unfinished.npz").write_bytes(b"killed")
-    changed = denoiser_table(data, tmp_path / "out", kinds=("3", "noise"), pairs=tmp_path / "pairs")
+    study = Study(data, tmp_path / "out", seeds=1)
+    monkeypatch.setattr(denoiser_study, "run_fit", lambda *given: 1 / 0)  # not called
+    changed = denoiser_table(study, kinds=("3", "noise"), pairs=tmp_path / "pairs")
     assert changed["artifacts"]["renders"] == {"real": 2, "synthetic": 2}
     assert "octaves from the training pairs'" in (tmp_path / "out/study.md").read_text()
     assert changed["scenes"]["ball"]["before"] == ball["before"]
-    assert changed["scenes"]["ball"]["after"] != ball["after"], "other weights are scored again"
+    assert changed["scenes"]["ball"]["after"] != ball["after"]
 
 
-def test_a_fit_of_other_photos_is_not_taken_for_done(tmp_path, monkeypatch):
-    short = replace(presets.settings_for("default", 8), steps=5, max_splats=50)
+def test_fits_of_other_photos_are_repeated(tmp_path, monkeypatch):
+    short = replace(presets.settings_for(8), steps=5, max_splats=50)
     monkeypatch.setattr(presets, "_default", lambda *_: short)
     monkeypatch.setattr(degraded_fits, "PAPER_STEPS", 5)
     made = scenes.capture(views=6, size=24)
     scenes.write_capture(tmp_path / "data/ball", made)
-    options = {"kinds": ("3", "paper"), "backend": "cpu"}
-    first = denoiser_table(tmp_path / "data", tmp_path / "out", **options)
+    study = Study(tmp_path / "data", tmp_path / "out", seeds=1)
+    kinds = ("3", "paper")
+    first = denoiser_table(study, kinds=kinds)
     assert set(first["mean"]) == {"sparse", "paper"}
     assert first["protocol"]["kinds"]["paper"] == "at most 20 photos, raw-affine 0.01, 5 steps"
     darker = [replace(view, image=view.image // 2) for view in made.views]
     scenes.write_capture(tmp_path / "data/ball", replace(made, views=darker))
-    second = denoiser_table(tmp_path / "data", tmp_path / "out", **options)
-    other = denoiser_table(tmp_path / "data", tmp_path / "other", **options)
+    second = denoiser_table(study, kinds=kinds)
+    other = denoiser_table(replace(study, out=tmp_path / "other"), kinds=kinds)
     ball = [report["scenes"]["ball"] for report in (first, second, other)]
     assert ball[1] == ball[2] != ball[0]
-
-
-def test_scenes_whose_files_would_have_one_name_are_refused(tmp_path):
-    for scene in ("more/ball", "more-ball"):
-        scenes.write_capture(tmp_path / scene, scenes.capture(views=6, size=24))
-    with pytest.raises(igsr.IgsrError, match=r"files of .* and .* would have one name; rename one"):
-        denoiser_table(tmp_path, tmp_path / "out")
 
 
 @pytest.mark.parametrize(
@@ -208,31 +197,21 @@ def test_scenes_whose_files_would_have_one_name_are_refused(tmp_path):
     [
         ({"kinds": ("4",)}, "kinds must be of 3, 6, 9, noise, paper, not '4'"),
         ({"kinds": ()}, "kinds must be of"),
-        ({"seeds": 0}, "at least 1"),
         ({"scenes": ("ball", "more/ball")}, "two scenes are called ball"),
         ({"scenes": ("nothing",)}, "nothing does not exist"),
         ({"denoisers": {"igsr": "a"}}, "denoisers cannot be called igsr or before"),
-        ({"denoisers": {"before": "a"}}, "denoisers cannot be called igsr or before"),
         ({"denoisers": {"mine": "nothing.safetensors"}}, "nothing.safetensors does not exist"),
         ({"pairs": "nothing"}, "nothing holds no pairs of recipe sparse"),
         ({"kinds": ("9",)}, "views must be from 1 to 5, not 9"),
+        ({"scenes": ("more/cube", "more-cube")}, "more/cube and more-cube would have one name"),
     ],
 )
-def test_bad_arguments(data, tmp_path, monkeypatch, options, message):
+def test_bad_arguments_are_refused_before_the_first_fit(
+    data, tmp_path, monkeypatch, options, message
+):
     weights(tmp_path / "same.safetensors")
-    monkeypatch.setattr(denoiser_comparison, "SHIPPED", tmp_path / "same.safetensors")
+    monkeypatch.setattr(denoiser_study, "SHIPPED", tmp_path / "same.safetensors")
+    paths = {name: tmp_path / value for name, value in options.items() if name == "pairs"}
     with pytest.raises(igsr.IgsrError, match=message):
-        denoiser_table(data, tmp_path / "out", **options)
+        denoiser_table(Study(data, tmp_path / "out"), **{**options, **paths})
     assert not (tmp_path / "out").exists()
-
-
-def test_bad_arguments_of_the_command(data, tmp_path, lab_here):
-    study = ["study", "denoiser-table", data, "--out", tmp_path / "out"]
-    done = lab_here(*study, "--denoiser", "mine")
-    assert done.returncode == 1
-    assert "--denoiser must be NAME=FILE, each name once, not 'mine'" in done.stderr
-    done = lab_here("study", "poses", data, "--out", tmp_path / "out", "--kind", "3")
-    assert done.returncode == 2
-    assert "No such option: --kind" in done.stderr
-    with pytest.raises(igsr.IgsrError, match="holds no folder of photos with cameras"):
-        scenes_in(data / "empty")

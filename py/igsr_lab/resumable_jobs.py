@@ -8,8 +8,9 @@ import os
 from collections.abc import Callable
 from concurrent.futures import as_completed
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from igsr import _core
 from igsr._internal.atomic_write import atomic_write
@@ -18,17 +19,20 @@ from igsr._internal.worker_processes import worker_processes
 from igsr.errors import IgsrError
 
 
+Row = dict[str, Any]
+T = TypeVar("T")
+
+
 @dataclass(frozen=True)
 class Run:
     """One run of a study, such as a fit.
 
     Attributes:
         name: of its file, without ending.
-        what: describes it; what ``work`` is called with.
-        settings: all that its result depends on. A run with other settings is done again.
-        leaves: a file that it leaves beside its row, if any; without that it is not done.
-        scene: its folder in the data; the hash of all its files joins the settings, as "data",
-            since photos and cameras may be corrected. None where the settings say all.
+        what: argument of the function that does the run.
+        settings: everything that the result depends on; a change repeats the run.
+        leaves: a file that it writes, if any; if that is missing, the run is repeated.
+        scene: folder in the data whose files' hash is added to the settings as "data", or None.
     """
 
     name: str
@@ -55,32 +59,26 @@ def folder_hash(folder: Path) -> str:
 def finished_runs(
     folder: Path,
     runs: list[Run],
-    work: Callable[[str, Any], dict[str, Any]],
+    work: Callable[[str, Any], Row],
     data: str,
     jobs: int,
-    on_run: Callable[[int, int, dict[str, Any]], None] | None,
+    on_run: Callable[[int, int, Row], None] | None,
     ray: bool = False,
-) -> list[dict[str, Any]]:
-    """The row of every run, in order: read where its file is there, else done and written.
-
-    A run is done again if its file is of another version, has other settings (presets and photos
-    change), or if a file that it left is gone. When one run fails, those under way are still
-    finished and kept.
+) -> list[Row]:
+    """Return the row of every run, in order; do the runs whose files are missing or outdated.
 
     Args:
         folder: of the runs' files.
-        runs: what there is to do.
-        work: does one run, given ``data`` and ``Run.what``; returns its row, which JSON can hold.
-        data: folder that holds the scenes.
-        jobs: runs at a time on this machine, each in a process of its own with its share of cores.
-        on_run: called with (done, all, the run's row) after each run.
-        ray: run on the Ray cluster that this machine is part of, or on a local one, as many at a
-            time as it has room for; its machines see ``data`` under the same path.
+        runs: the runs.
+        work: called with ``data`` and ``Run.what``; returns the row, as JSON values.
+        data: folder with the scenes.
+        jobs, ray: as ``execute``.
+        on_run: called with (done, total, row) after each run.
 
     Raises:
         IgsrError: a run fails, its file cannot be read or written, or Ray is not installed.
     """
-    rows: dict[str, dict[str, Any]] = {}
+    rows: dict[str, Row] = {}
     missing = []
     scenes = {run.scene for run in runs if run.scene is not None}
     hashes = {scene: folder_hash(Path(data) / scene) for scene in scenes}
@@ -98,7 +96,7 @@ def finished_runs(
         else:
             missing.append(run)
 
-    def keep(run: Run, row: dict[str, Any]) -> None:
+    def keep(run: Run, row: Row) -> None:
         row = {**row, **about(run)}
         folder.mkdir(parents=True, exist_ok=True)
         with atomic_write(folder / f"{run.name}.json") as temporary:
@@ -107,31 +105,66 @@ def finished_runs(
         if on_run is not None:
             on_run(len(rows), len(runs), row)
 
-    if ray and missing:
-        with RayCluster() as cluster:
-            cluster.check(Path(data).resolve())
-            cluster.run(lambda run: work(data, run.what), missing, keep)
-    elif jobs == 1:
-        for run in missing:
-            keep(run, work(data, run.what))
-    elif missing:
-        threads = max(1, (os.cpu_count() or 1) // jobs)
-        with worker_processes(jobs, threads) as pool:
-            pending = {pool.submit(work, data, run.what): run for run in missing}
-            try:
-                for done in as_completed(pending):
-                    keep(pending[done], done.result())
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                for other, run in pending.items():
-                    finished = other.done() and not other.cancelled()
-                    if finished and run.name not in rows and other.exception() is None:
-                        keep(run, other.result())
-                raise
+    execute(partial(_do, work, data), missing, keep, jobs=jobs, ray=ray, shared=Path(data))
     return [rows[run.name] for run in runs]
 
 
-def _read(path: Path) -> dict[str, Any] | None:
+def _do(work: Callable[[str, Any], Row], data: str, run: Run) -> Row:
+    return work(data, run.what)
+
+
+def execute(
+    work: Callable[[T], Row],
+    pieces: list[T],
+    keep: Callable[[T, Row], None],
+    *,
+    jobs: int,
+    ray: bool,
+    shared: Path,
+) -> None:
+    """Do pieces of work here, in several processes, or on a Ray cluster.
+
+    After a failure, pieces that are under way are still finished and kept.
+
+    Args:
+        work: does one piece; returns its row.
+        pieces: the work.
+        keep: called with each finished piece and its row.
+        jobs: number of processes, which share the cores.
+        ray: run on the Ray cluster of this machine, or on a local one.
+        shared: a folder that all machines of the cluster must see at the same path.
+
+    Raises:
+        IgsrError: a piece fails, or Ray is not installed.
+    """
+    if not pieces:
+        return
+    if ray:
+        with RayCluster() as cluster:
+            cluster.check(shared.resolve())
+            cluster.run(lambda piece: work(piece), pieces, keep)  # Ray does not accept a partial
+        return
+    if jobs == 1:
+        for piece in pieces:
+            keep(piece, work(piece))
+        return
+    with worker_processes(jobs, max(1, (os.cpu_count() or 1) // jobs)) as pool:
+        pending = {pool.submit(work, piece): piece for piece in pieces}
+        kept = set()
+        try:
+            for done in as_completed(pending):
+                keep(pending[done], done.result())
+                kept.add(done)
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            for other, piece in pending.items():
+                finished = other.done() and not other.cancelled()
+                if finished and other not in kept and other.exception() is None:
+                    keep(piece, other.result())
+            raise
+
+
+def _read(path: Path) -> Row | None:
     if not path.is_file():
         return None
     try:
