@@ -18,7 +18,6 @@ from igsr._internal.ray_jobs import RayCluster
 from igsr._internal.worker_processes import worker_processes
 from igsr.errors import IgsrError
 
-
 Row = dict[str, Any]
 T = TypeVar("T")
 

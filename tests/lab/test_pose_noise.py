@@ -12,7 +12,7 @@ import scenes
 import igsr
 from igsr.capture import Capture
 from igsr.fitting import presets
-from igsr.geometry.camera_noise import Noise
+from igsr_lab.camera_noise import Noise
 from igsr_lab.study import Study, noisy_poses, pose_noise
 from igsr_lab.study.noisy_poses import CLEAN, PoseFit, compared, run_fit
 

@@ -12,9 +12,9 @@ import scenes
 from ray_stand_in import stand_in_ray
 
 import igsr
-from igsr_lab.resumable_jobs import folder_hash
 from igsr.capture import Capture
 from igsr_lab.presets import PRESETS, preset_settings
+from igsr_lab.resumable_jobs import folder_hash
 from igsr_lab.study import Study, blender8, few_photos, preset_fits
 from igsr_lab.study.preset_fits import (
     SCORES,

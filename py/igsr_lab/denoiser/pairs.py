@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from igsr._internal.choices import FitBackend
-from igsr_lab.resumable_jobs import Run, finished_runs
 from igsr.capture import Capture, View, load_capture
 from igsr.denoiser.inputs import CHANNELS, COLOR
 from igsr.errors import IgsrError
@@ -20,7 +19,7 @@ from igsr.evaluation.metrics import psnr
 from igsr.evaluation.scores import WHITE
 from igsr.fitting.fingerprint import fingerprint
 from igsr.fitting.fit_capture import fit_capture
-from igsr.geometry.camera_noise import AFFINE, MATRIX, TURN, Noise, noise_unit, noisy_view
+from igsr_lab.camera_noise import AFFINE, MATRIX, TURN, Noise, noise_unit, noisy_view
 from igsr_lab.denoiser.pair_files import (
     DEFAULT_RECIPES,
     RECIPES,
@@ -30,6 +29,7 @@ from igsr_lab.denoiser.pair_files import (
     write_pairs,
 )
 from igsr_lab.presets import PAPER_STEPS, preset_settings
+from igsr_lab.resumable_jobs import Run, finished_runs
 
 #: Numbers of photos of "sparse" and "underfit" fits.
 FEW = (3, 4, 5, 6, 8, 9, 12, 16)

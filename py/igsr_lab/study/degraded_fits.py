@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 
 from igsr._internal.choices import FitBackend
-from igsr_lab.resumable_jobs import Run
 from igsr.capture import Capture, View, load_capture
 from igsr.capture.load import holds_cameras
 from igsr.errors import IgsrError
 from igsr.evaluation.scores import known_background
 from igsr.fitting.fit_capture import fit_capture
-from igsr.geometry.camera_noise import AFFINE, MATRIX, Noise, noise_unit, noisy_view
+from igsr_lab.camera_noise import AFFINE, MATRIX, Noise, noise_unit, noisy_view
 from igsr_lab.denoiser.pair_files import check_one_size, rendered_pairs, write_pairs
 from igsr_lab.presets import PAPER_STEPS, preset_settings
+from igsr_lab.resumable_jobs import Run
 from igsr_lab.study.splits import HOLDOUT, dtu_views, is_dtu, llff_views, spread_out
 from igsr_lab.study.study import Row
 

@@ -8,13 +8,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from igsr_lab.resumable_jobs import Run, file_hash, finished_runs
 from igsr.denoiser.cleaning import DOUBT, MIN_CHANGE, NetworkDenoiser
 from igsr.denoiser.weights import SHIPPED, load_network
 from igsr.errors import IgsrError
 from igsr_lab.denoiser.pair_files import read_pairs
 from igsr_lab.denoiser.perceptual_distance import SqueezeNetDistance
 from igsr_lab.report_parts import write_sheet
+from igsr_lab.resumable_jobs import Run, file_hash, finished_runs
 from igsr_lab.study.artifact_likeness import Likeness, likeness, plot_likeness
 from igsr_lab.study.cleaned_renders import Cleaning, ViewToClean, run_cleaning, to_uint8
 from igsr_lab.study.degraded_fits import (

@@ -6,7 +6,6 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from igsr_lab.resumable_jobs import Run
 from igsr.capture import Camera, load_capture
 from igsr.capture.load import holds_cameras
 from igsr.capture.photo_folder import Photo, load_photos
@@ -14,6 +13,7 @@ from igsr.errors import IgsrError
 from igsr.geometry.pose_errors import pose_accuracy
 from igsr.pose.registry import ESTIMATORS
 from igsr_lab.report_parts import cell, markdown_table
+from igsr_lab.resumable_jobs import Run
 from igsr_lab.study.study import Row, Study
 
 SCENES = (

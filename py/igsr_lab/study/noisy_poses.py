@@ -11,17 +11,17 @@ from pathlib import Path
 import numpy as np
 
 from igsr._internal.choices import FitBackend
-from igsr_lab.resumable_jobs import Run
 from igsr.capture import Capture, load_capture
 from igsr.errors import IgsrError
 from igsr.evaluation.scores import WHITE, evaluate
 from igsr.fitting.fit_capture import fit_capture
 from igsr.fitting.pose_refinement import refine_cameras
 from igsr.fitting.settings import Poses
-from igsr.geometry.camera_noise import AFFINE, MATRIX, TURN, Noise, noisy_view
 from igsr.geometry.pose_errors import pose_errors
+from igsr_lab.camera_noise import AFFINE, MATRIX, TURN, Noise, noisy_view
 from igsr_lab.presets import preset_settings
 from igsr_lab.report_parts import markdown_table, new_figure, save_figure
+from igsr_lab.resumable_jobs import Run
 from igsr_lab.study.preset_fits import REFINED
 from igsr_lab.study.scoring import aligned_views
 from igsr_lab.study.study import Row, Study, deviation, seed_means, with_spread

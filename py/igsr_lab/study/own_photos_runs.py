@@ -15,7 +15,7 @@ from igsr.capture import Camera, Capture, View, load_capture
 from igsr.capture.downscaling import resized_camera
 from igsr.capture.photo_folder import FRAMES, photo_sizes
 from igsr.errors import IgsrError
-from igsr.evaluation.contact_sheet import flip_sheet, save_sheet, sheet_names
+from igsr.evaluation.contact_sheet import save_sheet, sheet_names
 from igsr.evaluation.limits import limit_of
 from igsr.evaluation.quick_scores import quick_views, train_photos
 from igsr.evaluation.scores import METRICS, ScoredView, default_background, score_views
@@ -28,6 +28,7 @@ from igsr.pose.load import check_enough_placed
 from igsr.splats import Splats
 from igsr_lab.denoiser.perceptual_distance import SqueezeNetDistance
 from igsr_lab.presets import Preset, preset_keywords
+from igsr_lab.study.flip_sheet import flip_sheet
 from igsr_lab.study.left_half import LEFT_HALF, left_half_scores
 from igsr_lab.study.scoring import aligned_views, known_means, masked_distance
 from igsr_lab.study.study import Row

@@ -9,16 +9,16 @@ from typing import Any
 
 from igsr import _core
 from igsr._internal.part_usage import total
-from igsr_lab.resumable_jobs import Run, file_hash
 from igsr._internal.worker_processes import in_a_process
+from igsr.capture.image_files import SUFFIXES
 from igsr.capture.load import holds_cameras
 from igsr.capture.photo_folder import photo_sizes
-from igsr.capture.photos import SUFFIXES
 from igsr.errors import IgsrError
 from igsr.evaluation.quick_scores import MAX_TRAIN_PHOTOS
 from igsr.fitting.presets import default_max_size
 from igsr_lab.denoiser.perceptual_distance import SqueezeNetDistance
 from igsr_lab.presets import Preset, preset_settings
+from igsr_lab.resumable_jobs import Run, file_hash
 from igsr_lab.study.own_photos_report import write_report
 from igsr_lab.study.own_photos_runs import (
     CameraRun,

@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 
 from igsr._internal.choices import FitBackend
-from igsr_lab.resumable_jobs import Run
 from igsr.capture import Capture, load_capture
 from igsr.errors import IgsrError
 from igsr.evaluation.scores import default_background, evaluate
@@ -23,6 +22,7 @@ from igsr_lab.report_parts import (
     new_figure,
     save_figure,
 )
+from igsr_lab.resumable_jobs import Run
 from igsr_lab.study.scoring import aligned_views
 from igsr_lab.study.splits import dtu_views, is_dtu, llff_views, with_train_views
 from igsr_lab.study.study import SCORE_COLUMNS, Row, Study, by_preset, grouped, with_spread

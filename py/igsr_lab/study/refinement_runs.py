@@ -21,7 +21,6 @@ from igsr import _core
 from igsr._internal.atomic_write import atomic_write
 from igsr._internal.choices import FitBackend
 from igsr._internal.json_file import write_json
-from igsr_lab.resumable_jobs import file_hash
 from igsr.capture import Camera, Capture, View, load_capture
 from igsr.denoiser.weights import SHIPPED
 from igsr.errors import IgsrError
@@ -32,6 +31,7 @@ from igsr.refinement.refine_photos import refine, round_denoiser
 from igsr.refinement.results import Refined
 from igsr.splats import Splats
 from igsr_lab.denoiser.perceptual_distance import SqueezeNetDistance
+from igsr_lab.resumable_jobs import file_hash
 from igsr_lab.study.refinement_methods import Method, refine_keywords
 from igsr_lab.study.scoring import known_means, masked_distance
 from igsr_lab.study.splits import HOLDOUT, localized, scattered, spread_out

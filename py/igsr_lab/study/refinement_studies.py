@@ -17,7 +17,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from igsr_lab.resumable_jobs import Run
 from igsr.capture import load_capture
 from igsr.denoiser.weights import load_network
 from igsr.errors import IgsrError
@@ -25,6 +24,7 @@ from igsr.fitting.presets import default_max_size
 from igsr.refinement.rounds import MAX_SELECTED
 from igsr_lab.denoiser.perceptual_distance import SqueezeNetDistance
 from igsr_lab.presets import preset_settings
+from igsr_lab.resumable_jobs import Run
 from igsr_lab.study.refinement_methods import METHODS, OURS, PAPER, Method
 from igsr_lab.study.refinement_report import (
     mean_gains,

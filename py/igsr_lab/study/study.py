@@ -15,8 +15,8 @@ from igsr import _core
 from igsr._internal.atomic_write import atomic_write
 from igsr._internal.choices import FitBackend
 from igsr._internal.json_file import write_json
-from igsr_lab.resumable_jobs import Run, finished_runs
 from igsr.errors import IgsrError
+from igsr_lab.resumable_jobs import Run, finished_runs
 
 Row = dict[str, Any]
 

@@ -29,8 +29,8 @@ import psutil
 from PIL import Image
 
 from igsr._internal.atomic_write import check_writable
-from igsr_lab.resumable_jobs import execute
 from igsr.errors import IgsrError
+from igsr_lab.resumable_jobs import execute
 from igsr_lab.synth.cameras import Viewpoint, draw_rig
 from igsr_lab.synth.mitsuba_scene import (
     LoadedScene,
