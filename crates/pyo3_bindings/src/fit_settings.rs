@@ -53,7 +53,6 @@ pub fn config_from(config: &Bound<'_, PyDict>) -> PyResult<FitConfig> {
         density,
         background,
         dropout: setting(config, "dropout")?.unwrap_or(default.dropout),
-        hull: setting(config, "hull")?.unwrap_or(default.hull),
         depth_weight: setting(config, "depth_weight")?.unwrap_or(default.depth_weight),
         coarse_to_fine: setting(config, "coarse_to_fine")?.unwrap_or(default.coarse_to_fine),
         rates: if frozen { Rates::ZERO } else { default.rates },

@@ -3,7 +3,7 @@
 use glam::DMat4;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use splat_render::fit::{CameraState, DensityStats, Exposure, ExposureState, FitState, Hold};
+use splat_render::fit::{CameraState, DensityStats, Exposure, ExposureState, FitState, PosePrior};
 
 use crate::arrays::{elements, entry, rows, shaped, shaped_rows};
 use crate::camera::viewmat;
@@ -119,7 +119,7 @@ pub fn set_exposure_state(dict: &Bound<'_, PyDict>, state: ExposureState) -> PyR
 /// Pose priors of the cameras: `viewmats` [V, 4, 4], `intrinsics` [V, 4], `information` [V, 6, 6] (the
 /// inverse covariance of rotation and translation), `focal_information` [V] (of the logarithm of the
 /// focal length).
-pub fn holds_from(dict: &Bound<'_, PyDict>, count: usize) -> PyResult<Vec<Hold>> {
+pub fn holds_from(dict: &Bound<'_, PyDict>, count: usize) -> PyResult<Vec<PosePrior>> {
     let n = count as isize;
     let viewmats = entry::<f64>(dict, "viewmats")?;
     let viewmats = rows::<f64, 4>("viewmats", &viewmats, &[n, 4])?.as_chunks::<4>().0;
@@ -131,7 +131,7 @@ pub fn holds_from(dict: &Bound<'_, PyDict>, count: usize) -> PyResult<Vec<Hold>>
     let focal_information = elements("focal_information", &focal_information, &[n])?;
     let hold = |i: usize| {
         let [fx, fy, ..] = intrinsics[i];
-        Hold {
+        PosePrior {
             viewmat: viewmat(&viewmats[i]),
             focal: [fx, fy],
             pose: information[i],

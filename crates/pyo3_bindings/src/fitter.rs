@@ -86,7 +86,7 @@ impl Fitter {
                 fitter.set_rigs(&rigs)?;
             }
             if let Some(holds) = holds {
-                fitter.hold_cameras(holds)?;
+                fitter.set_pose_priors(holds)?;
             }
             if let Some((exposures, pulls)) = exposures {
                 fitter.start_exposures(&exposures, &pulls)?;

@@ -55,7 +55,6 @@ fn config(density: DensityControl) -> FitConfig {
         density,
         background: Background::Random,
         dropout: 0.2,
-        hull: true,
         cameras: Some(CameraConfig { focal: Focal::Shared, ..CameraConfig::default() }),
         ..FitConfig::default()
     }
@@ -183,12 +182,7 @@ fn a_fit_from_coarse_to_fine_resumes_with_the_same_bits_and_moves_cameras_as_a_w
         .collect();
     let steps = 100;
     let coarse = |state: FitState, step| {
-        let config = FitConfig {
-            steps,
-            coarse_to_fine: true,
-            hull: false,
-            ..config(DensityControl::Original)
-        };
+        let config = FitConfig { steps, coarse_to_fine: true, ..config(DensityControl::Original) };
         let device = Box::new(CpuFit::default());
         Fitter::new(device, targets.clone(), cameras.clone(), state, step, config).unwrap()
     };
@@ -520,7 +514,7 @@ fn pixels_of_half_the_weight_count_half() {
         for target in &mut targets {
             target.weights = weight.map(|w| vec![w; target.pixels.len() / 4]);
         }
-        let config = FitConfig { hull: false, ..config(DensityControl::Mcmc) };
+        let config = config(DensityControl::Mcmc);
         let device = Box::new(CpuFit::default());
         let mut fitter = Fitter::new(device, targets, cameras, start(1), 0, config).unwrap();
         fitter.step().unwrap();
@@ -596,7 +590,7 @@ fn a_whole_fit_whose_colors_wait_ends_with_the_same_bits() {
             let (targets, cameras) = photos();
             // Each camera sees a part of the scene.
             let cameras = cameras.iter().map(|c| Camera { fx: 3.0 * c.fx, fy: 3.0 * c.fy, ..*c });
-            let config = FitConfig { hull: false, ..config(density) };
+            let config = config(density);
             let device = Box::new(device);
             let mut fitter =
                 Fitter::new(device, targets, cameras.collect(), start(1), 0, config).unwrap();

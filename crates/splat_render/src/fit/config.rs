@@ -60,8 +60,6 @@ pub struct FitConfig {
     /// Part of the splats that a step leaves out at random, growing from none in the first step to
     /// this in the last (DropGaussian).
     pub dropout: f32,
-    /// Whether splats outside the visual hull of photos with alpha are removed.
-    pub hull: bool,
     /// How cameras are fitted, or None: they are taken as exact.
     pub cameras: Option<CameraConfig>,
     /// Whether a gain and an offset per channel of each photo are fitted; see [`super::Exposures`].
@@ -98,7 +96,6 @@ impl Default for FitConfig {
             },
             rate_scale: 1.0,
             dropout: 0.0,
-            hull: false,
             cameras: None,
             exposures: false,
             coarse_to_fine: false,

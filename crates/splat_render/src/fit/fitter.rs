@@ -14,7 +14,6 @@ use super::cameras::{CameraState, Cameras, PosePrior, scene_distance};
 use super::config::{Background, DensityControl, FitConfig};
 use super::density;
 use super::exposures::{ExposureState, Exposures};
-use super::hull::Hull;
 use crate::camera::Camera;
 use crate::error::{Error, Result};
 use crate::fit_device::{FitDevice, FitState, McmcRun, OriginalRun, StepInput};
@@ -56,7 +55,6 @@ pub struct Fitter {
     has_alpha: Vec<bool>,
     /// Each photo's own background, where that is known.
     behind: Vec<Option<[f32; 3]>>,
-    hull: Option<Hull>,
     extent: f32,
     /// How often each photo comes in a round of steps, and the first step that is not of it.
     schedule: Vec<(u32, Option<u32>)>,
@@ -130,7 +128,6 @@ impl Fitter {
             return Err(Error::argument("images", "has none that is fitted to until the end"));
         }
         let schedule = targets.iter().map(|target| (target.turns, target.until)).collect();
-        let hull = config.hull.then(|| Hull::new(&targets));
         let longest = targets.iter().map(|t| t.width.max(t.height)).max().unwrap_or(1);
         let splats = state.moving();
         let moving = config.cameras.map(|moving| {
@@ -152,7 +149,6 @@ impl Fitter {
             exposures,
             has_alpha,
             behind,
-            hull,
             schedule,
             round: Vec::new(),
             order: Vec::new(),
@@ -258,11 +254,6 @@ impl Fitter {
             return Err(Error::argument("rigs", "are of cameras that are not fitted"));
         };
         cameras.set_rigs(numbers)
-    }
-
-    /// [`Fitter::set_pose_priors`] under its first name.
-    pub fn hold_cameras(&mut self, holds: Vec<PosePrior>) -> Result<()> {
-        self.set_pose_priors(holds)
     }
 
     /// Sets the pose priors of the cameras that are fitted, one for each; before anything else.
@@ -413,29 +404,16 @@ impl Fitter {
             DensityControl::Fixed => 0.0,
         };
         let active = f64::from(step) < stop * f64::from(config.steps);
-        // Splats leave the hull as long as they move.
-        let leaving = self.hull.is_some() && step >= start && step.is_multiple_of(every);
         let refine = active && step >= start && step.is_multiple_of(every);
         let reset = active
             && config.density == DensityControl::Original
             && step.is_multiple_of(RESET_EVERY);
-        if !refine && !reset && !leaving {
+        if !refine && !reset {
             return Ok(());
         }
         let mut rng = self.rng(Draw::Density, u64::from(step));
         let mcmc = refine && config.density == DensityControl::Mcmc;
         let original = refine && config.density == DensityControl::Original;
-        if let Some(hull) = self.hull.as_ref().filter(|_| leaving) {
-            let (splats, cameras) = (&mut self.splats, &self.cameras);
-            let mut change = |state: &mut FitState| {
-                let inside = hull.inside(&state.splats, cameras);
-                if inside.len() < state.splats.len() {
-                    state.select(&inside);
-                }
-                *splats = state.splats.len();
-            };
-            self.device.edit(&mut |state| state.edit_moving(&mut change))?;
-        }
         if original {
             self.splats = self.device.original(&OriginalRun {
                 max_splats: config.max_splats,

@@ -6,7 +6,6 @@ mod config;
 mod density;
 mod exposures;
 mod fitter;
-mod hull;
 mod initial;
 mod plane_sweep;
 
@@ -25,6 +24,3 @@ pub use crate::fit_device::{
 pub use crate::splats::SplatArrays;
 pub use crate::stages::{Exposure, Rates};
 pub use crate::target::{Target, TargetDepth, Weight};
-
-/// [`PosePrior`] under its first name.
-pub use cameras::PosePrior as Hold;
