@@ -6,6 +6,7 @@ use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
 use splat_render::cpu::Cpu;
 use splat_render::reference::Reference;
+use splat_render::stages::Float;
 use splat_render::{
     Colors, Image, ImageGradients, ProjectOptions, Projected, ProjectedGradients, SplatGradients,
     SplatParams, Stages,
@@ -18,7 +19,7 @@ use crate::camera::camera;
 use crate::error::to_python;
 
 /// A number type that numpy and the stages share: f32 or f64.
-pub trait Real: Element + Copy + Default + Send + Sync {}
+pub trait Real: Element + Float + Default + Send + Sync {}
 impl Real for f32 {}
 impl Real for f64 {}
 

@@ -1,24 +1,25 @@
-//! What passes between the stages, and the trait that the implementations share.
+//! The data that passes between the stages, and [`Stages`], the trait of all implementations.
 //!
 //! All arrays are on the host; an implementation may keep its own copies where its kernels run.
 //! `T` is f64 in the reference and f32 elsewhere.
 
-pub(crate) mod check;
 mod depth_loss;
 mod exposure;
+mod interface;
 
-use num_traits::Float;
+/// The trait of number types that [`Stages`] takes: f32 and f64.
+pub use num_traits::Float;
 
-use crate::camera::{Camera, check_size};
+use crate::camera::check_size;
 use crate::constants::{ADAM, BLUR, FAR, NEAR};
 use crate::error::{Error, Result};
 use crate::splats::SplatArrays;
-use crate::target::{Target, TargetDepth};
 
 pub use crate::splats::{Colors, SplatParams};
 pub use depth_loss::DepthLoss;
 pub(crate) use depth_loss::pixel as depth_pixel;
 pub use exposure::{Exposure, ExposureGradients};
+pub use interface::Stages;
 
 /// Checks that every named length is `expected`; `unit` goes between the two numbers of the error.
 fn check_lengths(lengths: &[(&str, usize)], expected: usize, unit: &str) -> Result<()> {
@@ -123,9 +124,10 @@ impl<T: Copy + Default> Projected<T> {
             radii: vec![[z; 2]; n],
         }
     }
+}
 
-    /// Checks what a caller may have put together by hand: the size, and that all arrays are of
-    /// one length.
+impl<T> Projected<T> {
+    /// Checks the size, and that all arrays have the same length.
     pub fn validate(&self) -> Result<()> {
         check_size(self.width, self.height)?;
         let lengths = [
@@ -421,84 +423,4 @@ impl<T> AdamState<T> {
             "rows where sh has",
         )
     }
-}
-
-/// The stages, as every implementation offers them. `bin` runs inside the two rasterize stages.
-pub trait Stages<T> {
-    /// Splats and camera to 2D splats.
-    fn project(
-        &self,
-        splats: &SplatParams<'_, T>,
-        camera: &Camera,
-        options: &ProjectOptions,
-    ) -> Result<Projected<T>>;
-
-    /// 2D splats to a picture over `background`.
-    fn rasterize(&self, projected: &Projected<T>, background: [T; 3]) -> Result<Image<T>>;
-
-    /// Gradients of the picture to gradients of the 2D splats. `image` is what
-    /// [`Stages::rasterize`] returned for the same arguments. `absolute` asks for
-    /// [`ProjectedGradients::v_means2d_absolute`].
-    fn rasterize_backward(
-        &self,
-        projected: &Projected<T>,
-        background: [T; 3],
-        image: &Image<T>,
-        v_image: &ImageGradients<T>,
-        absolute: bool,
-    ) -> Result<ProjectedGradients<T>>;
-
-    /// Gradients of the 2D splats to gradients of the splats and the camera.
-    fn project_backward(
-        &self,
-        splats: &SplatParams<'_, T>,
-        camera: &Camera,
-        options: &ProjectOptions,
-        projected: &Projected<T>,
-        v_projected: &ProjectedGradients<T>,
-    ) -> Result<SplatGradients<T>>;
-
-    /// A picture's colours as a photo of some gain and offset has them, `[H * W]`; see [`Exposure`].
-    /// Of the image, colour and transmittance are read.
-    fn exposure(&self, image: &Image<T>, exposure: &Exposure<T>) -> Result<Vec<[T; 3]>>;
-
-    /// Gradients of the corrected colours, `[H * W]`, to those of the picture and of gain and offset.
-    /// The arguments are those of [`Stages::exposure`].
-    fn exposure_backward(
-        &self,
-        image: &Image<T>,
-        exposure: &Exposure<T>,
-        v_corrected: &[[T; 3]],
-    ) -> Result<ExposureGradients<T>>;
-
-    /// Loss of a picture against a photo over `background`, with its gradient:
-    /// `sum_p w_p ((1 - s) mean_c |x - y| + s (1 - mean_c SSIM)) / count` over pixels p of weight w
-    /// and channels c, with s the `ssim_weight` in 0..=1, `count` the pixels whose weight is not 0,
-    /// and zeros around the picture in SSIM's window (Wang et al. 2004; 3DGS, eq. 7).
-    fn loss(
-        &self,
-        image: &Image<T>,
-        target: &Target,
-        background: [T; 3],
-        ssim_weight: f32,
-    ) -> Result<Loss<T>>;
-
-    /// Loss of a picture's depth against a photo's, with its gradients:
-    /// `sum_p c_p 2 |D_p - A_p z_p| / (D_p + A_p z_p) / count` over pixels p with A the picture's
-    /// alpha, D its accumulated depth, z the photo's depth, c its confidence, and `count` the pixels
-    /// whose confidence is not 0. Where the two nearly agree, a pixel's term is their relative
-    /// difference; it is at most 2, so that single wrong depths have little say. Pixels with A less
-    /// than [`DEPTH_ALPHA`](crate::constants::DEPTH_ALPHA) do not count. Of the image, alpha, depth
-    /// and transmittance are read.
-    fn depth_loss(&self, image: &Image<T>, target: &TargetDepth) -> Result<DepthLoss<T>>;
-
-    /// One optimiser step of all parameters (Kingma and Ba, 2015, algorithm 1), with the pull of the
-    /// regularisers and, after it, the exploration noise. `gradients` are those of
-    /// [`Stages::project_backward`]; its camera's are not read.
-    fn adam(
-        &self,
-        state: &mut AdamState<T>,
-        gradients: &SplatGradients<T>,
-        step: &AdamStep,
-    ) -> Result<()>;
 }

@@ -32,7 +32,7 @@ fn widened(splats: &SplatParams<'_, f32>) -> Scene<f64> {
 }
 
 impl Stages<f32> for Narrowed {
-    fn project(
+    fn project_unchecked(
         &self,
         splats: &SplatParams<'_, f32>,
         camera: &Camera,
@@ -41,7 +41,11 @@ impl Stages<f32> for Narrowed {
         Ok(narrow_projected(&Reference.project(&widened(splats).params(), camera, options)?))
     }
 
-    fn rasterize(&self, projected: &Projected<f32>, background: [f32; 3]) -> Result<Image<f32>> {
+    fn rasterize_unchecked(
+        &self,
+        projected: &Projected<f32>,
+        background: [f32; 3],
+    ) -> Result<Image<f32>> {
         let image = Reference.rasterize(&widen_projected(projected), background.map(f64::from))?;
         Ok(Image {
             width: image.width,
@@ -53,7 +57,7 @@ impl Stages<f32> for Narrowed {
         })
     }
 
-    fn rasterize_backward(
+    fn rasterize_backward_unchecked(
         &self,
         projected: &Projected<f32>,
         background: [f32; 3],
@@ -79,7 +83,7 @@ impl Stages<f32> for Narrowed {
         })
     }
 
-    fn project_backward(
+    fn project_backward_unchecked(
         &self,
         splats: &SplatParams<'_, f32>,
         camera: &Camera,
@@ -105,11 +109,15 @@ impl Stages<f32> for Narrowed {
         })
     }
 
-    fn exposure(&self, image: &Image<f32>, exposure: &Exposure<f32>) -> Result<Vec<[f32; 3]>> {
+    fn exposure_unchecked(
+        &self,
+        image: &Image<f32>,
+        exposure: &Exposure<f32>,
+    ) -> Result<Vec<[f32; 3]>> {
         Ok(narrow(&Reference.exposure(&widen_image(image), &widen_exposure(exposure))?))
     }
 
-    fn exposure_backward(
+    fn exposure_backward_unchecked(
         &self,
         image: &Image<f32>,
         exposure: &Exposure<f32>,
@@ -125,7 +133,11 @@ impl Stages<f32> for Narrowed {
         })
     }
 
-    fn depth_loss(&self, image: &Image<f32>, target: &TargetDepth) -> Result<DepthLoss<f32>> {
+    fn depth_loss_unchecked(
+        &self,
+        image: &Image<f32>,
+        target: &TargetDepth,
+    ) -> Result<DepthLoss<f32>> {
         let loss = Reference.depth_loss(&widen_image(image), target)?;
         Ok(DepthLoss {
             value: loss.value as f32,
@@ -134,7 +146,7 @@ impl Stages<f32> for Narrowed {
         })
     }
 
-    fn loss(
+    fn loss_unchecked(
         &self,
         image: &Image<f32>,
         target: &Target,
@@ -146,7 +158,7 @@ impl Stages<f32> for Narrowed {
         Ok(Loss { value: narrow1(&[loss.value])[0], v_color: narrow(&loss.v_color) })
     }
 
-    fn adam(
+    fn adam_unchecked(
         &self,
         state: &mut AdamState<f32>,
         gradients: &SplatGradients<f32>,
