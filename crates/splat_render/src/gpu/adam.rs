@@ -5,12 +5,12 @@ use std::ops::Range;
 
 use super::bin::SplatBins;
 use super::device::{Gpu, Op};
+use super::kernels::Kernel;
 use super::layout::{
     GEOMETRY, GRADIENT, NOTE_PULL, NOTE_SEEN, NOTES, SPLATS_PER_GROUP, Step, View,
 };
 use super::project::{Projection, SPLAT_2D, SplatBuffers, rows, window_uniform};
 use super::project_backward::GradientBuffers;
-use super::shaders::Kernel;
 use crate::error::Result;
 use crate::fit_device::DensityStats;
 use crate::splats::{SplatArrays, SplatParams};

@@ -8,9 +8,9 @@ use std::ops::Range;
 use bytemuck::Zeroable;
 
 use super::device::{Gpu, Groups, Op};
+use super::kernels::Kernel;
 use super::layout::{ALL_SPLATS, Chunk, ChunkCount, SortPass, StatusHead};
 use super::project::Projection;
-use super::shaders::Kernel;
 use crate::constants::TILE;
 use crate::error::{Error, Result};
 

@@ -1,8 +1,8 @@
 //! depth_loss: relative difference of a picture's depth and a photo's, with its gradients.
 
 use super::device::{Gpu, Op};
+use super::kernels::Kernel;
 use super::layout::{DEPTH_GROUPS, DepthStep, View};
-use super::shaders::Kernel;
 use crate::error::Result;
 use crate::stages::{DepthLoss, Image};
 use crate::target::TargetDepth;

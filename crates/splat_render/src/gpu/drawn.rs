@@ -5,7 +5,7 @@ use bytemuck::{Pod, Zeroable};
 
 use super::bin::SplatBins;
 use super::device::{Gpu, Op};
-use super::shaders::Kernel;
+use super::kernels::Kernel;
 use crate::error::Result;
 use crate::fit_device::Cells;
 

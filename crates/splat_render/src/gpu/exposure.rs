@@ -1,8 +1,8 @@
 //! exposure and exposure_backward: a picture's colours as a photo of some gain and offset has them.
 
 use super::device::{Gpu, Op};
+use super::kernels::Kernel;
 use super::layout::{EXPOSURE_GROUPS, ExposureUniform, View};
-use super::shaders::Kernel;
 use crate::error::Result;
 use crate::stages::{Exposure, ExposureGradients, Image};
 

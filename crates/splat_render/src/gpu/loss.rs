@@ -4,8 +4,8 @@ use bytemuck::Zeroable;
 
 use super::bin::tile_count;
 use super::device::{Gpu, Op};
+use super::kernels::Kernel;
 use super::layout::{Step, View};
-use super::shaders::Kernel;
 use crate::constants::TILE;
 use crate::error::Result;
 use crate::stages::{Image, Loss};

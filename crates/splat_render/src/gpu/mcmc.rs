@@ -7,8 +7,8 @@ use rayon::prelude::*;
 
 use super::device::{Bound, Gpu, Op};
 use super::drawn::{Bounds, Drawn, Scans, words};
+use super::kernels::Kernel;
 use super::layout::GEOMETRY;
-use super::shaders::Kernel;
 use crate::error::Result;
 use crate::fit_device::{FogCamera, McmcRun, sampled_every, share_table, weight_table};
 

@@ -13,6 +13,7 @@ mod device;
 mod drawn;
 mod exposure;
 mod fit;
+mod kernels;
 mod layout;
 mod loss;
 mod mcmc;
@@ -23,15 +24,14 @@ mod rasterize;
 mod rasterize_backward;
 mod resident;
 mod resident_picture;
-mod shaders;
 mod traffic;
 mod waiting_colors;
 
 pub use device::{Gpu, Injected, needed_limits};
 pub use fit::{GpuFit, PlannedFit, StepWork};
+pub use kernels::{ShaderVariant, shader_variants, shared_wgsl};
 pub use resident::{ResidentSplats, ResidentView};
 pub use resident_picture::ResidentPicture;
-pub use shaders::{ShaderVariant, shader_variants, shared_wgsl};
 
 use crate::camera::Camera;
 use crate::error::Result;

@@ -8,9 +8,9 @@ use super::adam::AdamBuffers;
 use super::bin::SplatBins;
 use super::device::{Bound, Gpu, Op};
 use super::drawn::{Bounds, Drawn, Scans, words};
+use super::kernels::Kernel;
 use super::layout::{GEOMETRY, SPLATS_PER_GROUP};
 use super::project::{count, window_uniform};
-use super::shaders::Kernel;
 use crate::error::Result;
 use crate::fit_device::OriginalRun;
 

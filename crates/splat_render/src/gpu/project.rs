@@ -3,8 +3,8 @@
 use std::ops::Range;
 
 use super::device::{Bound, Gpu, Op};
+use super::kernels::Kernel;
 use super::layout::{GEOMETRY, GRADIENT, SPLATS_PER_GROUP, Splat2d, View, Window};
-use super::shaders::Kernel;
 use crate::camera::Camera;
 use crate::error::{Error, Result};
 use crate::stages::{Colors, ProjectOptions, Projected, SplatParams};

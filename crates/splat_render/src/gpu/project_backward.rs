@@ -1,10 +1,10 @@
 //! project_backward: gradients of the 2D splats to gradients of the splats and the camera.
 
 use super::device::{Gpu, Op};
+use super::kernels::Kernel;
 use super::layout::{CAMERA, GEOMETRY, GRADIENT, SPLATS_PER_GROUP, View};
 use super::project::{Projection, SPLAT_2D, SplatBuffers, geometry_rows, rows, window_uniform};
 use super::rasterize::splats2d;
-use super::shaders::Kernel;
 use crate::camera::Camera;
 use crate::error::Result;
 use crate::stages::{

@@ -4,9 +4,9 @@ use bytemuck::Zeroable;
 
 use super::bin::{PairBins, SplatBins, TileChunk, tile_count};
 use super::device::{Gpu, Op};
+use super::kernels::Kernel;
 use super::layout::{Chunk, GRADIENT, Splat2d, View};
 use super::project::{Projection, count};
-use super::shaders::Kernel;
 use crate::error::Result;
 use crate::stages::{Image, Projected};
 

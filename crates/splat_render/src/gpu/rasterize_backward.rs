@@ -2,10 +2,10 @@
 
 use super::bin::{PairBins, SplatBins, TileChunk};
 use super::device::{Gpu, Op};
+use super::kernels::Kernel;
 use super::layout::{GRADIENT, GRADIENT_ABSOLUTE};
 use super::project::Projection;
 use super::rasterize::Binned;
-use super::shaders::Kernel;
 use crate::error::Result;
 use crate::stages::{Image, ImageGradients, Projected, ProjectedGradients};
 

@@ -5,8 +5,8 @@
 //! of a histogram) came from one.
 
 use super::device::{Gpu, Op};
+use super::kernels::Kernel;
 use super::project::SPLAT_2D;
-use super::shaders::Kernel;
 
 /// What a picture's work is made of.
 #[derive(Debug, Clone, Copy, PartialEq)]

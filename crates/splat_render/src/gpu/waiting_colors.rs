@@ -6,9 +6,9 @@ use std::ops::Range;
 use super::adam::AdamBuffers;
 use super::bin::SplatBins;
 use super::device::{Gpu, Op};
+use super::kernels::Kernel;
 use super::layout::{GEOMETRY, NOTES, SPLATS_PER_GROUP};
 use super::project::{Projection, SPLAT_2D, rows, window_uniform};
-use super::shaders::Kernel;
 
 impl AdamBuffers {
     /// Projects all splats, those that are seen with colours that are up to date; `steps` is a

@@ -9,7 +9,7 @@ use std::task::{Context, Poll, Waker};
 use super::limits::check_limits;
 use super::{GROUPS_MAX, Gpu, Injected, list_limit, note, one_line};
 use crate::error::{Error, Result};
-use crate::gpu::shaders::{Access, Build, Kernel, SOURCES, Source};
+use crate::gpu::kernels::{Build, Kernel};
 
 /// Futures of wgpu's native backends are ready at once or after `poll`.
 fn ready<T>(future: impl Future<Output = T>) -> T {
@@ -174,13 +174,11 @@ impl Gpu {
         device.set_device_lost_callback(move |_, message| {
             let _ = is_lost.set(one_line(&message));
         });
-        let layouts = SOURCES.iter().map(|source| bind_group_layout(&device, source)).collect();
         let gpu = Self {
             device,
             queue,
             info,
             pipelines: Kernel::ALL.iter().map(|_| OnceLock::new()).collect(),
-            layouts,
             failure,
             lost,
             injected: injected.clone(),
@@ -196,30 +194,4 @@ impl Gpu {
         gpu.check()?;
         Ok(gpu)
     }
-}
-
-fn bind_group_layout(device: &wgpu::Device, source: &Source) -> wgpu::BindGroupLayout {
-    let entries: Vec<_> = source
-        .bindings
-        .iter()
-        .enumerate()
-        .map(|(i, access)| wgpu::BindGroupLayoutEntry {
-            binding: i as u32,
-            visibility: wgpu::ShaderStages::COMPUTE,
-            ty: wgpu::BindingType::Buffer {
-                ty: match access {
-                    Access::Uniform => wgpu::BufferBindingType::Uniform,
-                    Access::Read => wgpu::BufferBindingType::Storage { read_only: true },
-                    Access::Write => wgpu::BufferBindingType::Storage { read_only: false },
-                },
-                has_dynamic_offset: false,
-                min_binding_size: None,
-            },
-            count: None,
-        })
-        .collect();
-    device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor {
-        label: Some(source.name),
-        entries: &entries,
-    })
 }

@@ -6,10 +6,10 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 
-use super::Gpu;
+use super::{Gpu, Pipeline};
 use crate::error::Result;
+use crate::gpu::kernels::{Access, Kernel, Source};
 use crate::gpu::layout::SPLATS_PER_GROUP;
-use crate::gpu::shaders::{Kernel, SOURCES, Source};
 
 /// A binding of a kernel.
 #[derive(Debug, Clone)]
@@ -70,24 +70,24 @@ pub(in crate::gpu) enum Op {
 }
 
 impl Gpu {
-    fn pipeline(&self, kernel: Kernel) -> &wgpu::ComputePipeline {
+    fn pipeline(&self, kernel: Kernel) -> &Pipeline {
         self.pipelines[kernel as usize].get_or_init(|| {
-            let (file, entry) = kernel.entry();
-            let source = Source::named(file);
+            let (source, entry) = (kernel.source(), kernel.entry());
             self.count(0);
             let module = self.device.create_shader_module(wgpu::ShaderModuleDescriptor {
-                label: Some(file),
+                label: Some(source.name),
                 source: wgpu::ShaderSource::Wgsl(
                     self.injected.text(source.text(self.build)).into(),
                 ),
             });
+            let bindings = bind_group_layout(&self.device, source);
             let layout = self.device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
-                label: Some(file),
-                bind_group_layouts: &[Some(self.layout(file))],
+                label: Some(source.name),
+                bind_group_layouts: &[Some(&bindings)],
                 immediate_size: 0,
             });
             let constants = source.constants(self.build);
-            self.device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+            let pipeline = self.device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
                 label: Some(entry),
                 layout: Some(&layout),
                 module: &module,
@@ -97,7 +97,8 @@ impl Gpu {
                     ..Default::default()
                 },
                 cache: None,
-            })
+            });
+            (pipeline, bindings)
         })
     }
 
@@ -110,11 +111,6 @@ impl Gpu {
             self.pipeline(kernel);
         });
         self.check()
-    }
-
-    fn layout(&self, file: &str) -> &wgpu::BindGroupLayout {
-        let index = SOURCES.iter().position(|source| source.name == file).unwrap_or(0);
-        &self.layouts[index]
     }
 
     /// Prepares a kernel on its bindings, in the order of their numbers.
@@ -141,14 +137,14 @@ impl Gpu {
                 }),
             })
             .collect();
-        let pipeline = self.pipeline(kernel).clone();
+        let (pipeline, layout) = self.pipeline(kernel);
         self.count(0);
         let bind_group = self.device.create_bind_group(&wgpu::BindGroupDescriptor {
-            label: Some(kernel.entry().1),
-            layout: self.layout(kernel.entry().0),
+            label: Some(kernel.entry()),
+            layout,
             entries: &entries,
         });
-        Op::Dispatch { kernel, bound, run: Some((pipeline, bind_group)), groups }
+        Op::Dispatch { kernel, bound, run: Some((pipeline.clone(), bind_group)), groups }
     }
 
     /// Workgroups for `count` invocations or tiles, spilling into y past the limit of x.
@@ -219,4 +215,30 @@ impl Gpu {
         self.queue.submit([encoder.finish()]);
         self.check()
     }
+}
+
+fn bind_group_layout(device: &wgpu::Device, source: &Source) -> wgpu::BindGroupLayout {
+    let entries: Vec<_> = source
+        .bindings
+        .iter()
+        .enumerate()
+        .map(|(i, access)| wgpu::BindGroupLayoutEntry {
+            binding: i as u32,
+            visibility: wgpu::ShaderStages::COMPUTE,
+            ty: wgpu::BindingType::Buffer {
+                ty: match access {
+                    Access::Uniform => wgpu::BufferBindingType::Uniform,
+                    Access::Read => wgpu::BufferBindingType::Storage { read_only: true },
+                    Access::Write => wgpu::BufferBindingType::Storage { read_only: false },
+                },
+                has_dynamic_offset: false,
+                min_binding_size: None,
+            },
+            count: None,
+        })
+        .collect();
+    device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor {
+        label: Some(source.name),
+        entries: &entries,
+    })
 }

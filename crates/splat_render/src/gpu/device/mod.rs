@@ -15,8 +15,11 @@ pub(super) use commands::{Bound, Groups, Op};
 pub use injected::Injected;
 pub use limits::needed_limits;
 
-use super::shaders::{Build, Kernel};
+use super::kernels::{Build, Kernel};
 use crate::error::{Error, Result};
+
+/// A compiled kernel and the layout of its bindings.
+type Pipeline = (wgpu::ComputePipeline, wgpu::BindGroupLayout);
 
 /// wgpu on one adapter, with this crate's kernels.
 #[derive(Debug)]
@@ -24,8 +27,8 @@ pub struct Gpu {
     pub(super) device: wgpu::Device,
     pub(super) queue: wgpu::Queue,
     info: wgpu::AdapterInfo,
-    pipelines: Vec<OnceLock<wgpu::ComputePipeline>>,
-    layouts: Vec<wgpu::BindGroupLayout>,
+    /// Kernels that were used, in the order of their numbers.
+    pipelines: Vec<OnceLock<Pipeline>>,
     /// First error that wgpu reported since the last check.
     failure: Arc<Mutex<Option<String>>>,
     /// Why the device was lost, after which nothing works on it.

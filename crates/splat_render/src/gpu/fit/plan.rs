@@ -47,7 +47,7 @@ impl StepWork {
     fn add_all(&mut self, ops: &[Op], bytes: &[f64]) {
         for (op, &bytes) in ops.iter().zip(bytes) {
             let (name, runs) = match op {
-                Op::Dispatch { kernel, .. } => (kernel.entry().1, 1),
+                Op::Dispatch { kernel, .. } => (kernel.entry(), 1),
                 Op::Clear(_) => ("clear", 0),
                 Op::Copy(..) => ("copy", 0),
             };

@@ -122,7 +122,7 @@ fn rasterize(
     let y = (tile / view.tiles_x) * TILE + ROWS * (thread / 4u);
     let center_x = f32(x) + vec4(0.5, 1.5, 2.5, 3.5);
     let center_y = f32(y) + 0.5;
-    // A line with {row} stands once for each of the thread's rows: shaders.rs repeats it. A loop over
+    // A line with {row} stands once for each of the thread's rows: gpu/kernels repeats it. A loop over
     // an array of rows is not unrolled by every driver, and then lives in memory.
     var quad{row} = start(x, y + {row}u);
     var walking = true;
