@@ -24,11 +24,10 @@ mod rasterize;
 mod rasterize_backward;
 mod resident;
 mod resident_picture;
-mod traffic;
 mod waiting_colors;
 
 pub use device::{Gpu, Injected, needed_limits};
-pub use fit::{GpuFit, PlannedFit, StepWork};
+pub use fit::{GpuFit, PlannedFit};
 pub use kernels::{ShaderVariant, shader_variants, shared_wgsl};
 pub use resident::{ResidentSplats, ResidentView};
 pub use resident_picture::ResidentPicture;

@@ -183,7 +183,7 @@ impl Gpu {
             lost,
             injected: injected.clone(),
             submissions_left: AtomicU64::new(0),
-            planned: None,
+            plans_only: false,
             made: Default::default(),
             host_bytes: AtomicU64::new(0),
             binding_limit,

@@ -18,15 +18,13 @@ impl Gpu {
     /// A buffer of at least `bytes`, with nothing of use in it.
     pub(in crate::gpu) fn buffer(&self, label: &str, bytes: u64) -> Result<wgpu::Buffer> {
         let size = bytes.max(BUFFER_MIN).next_multiple_of(4);
-        if self.planned.is_none() && size > self.device.limits().max_buffer_size {
+        if !self.plans_only && size > self.device.limits().max_buffer_size {
             return Err(self.error(&format!("holds no buffer of {size} bytes for {label}")));
         }
         if self.injected.buffer_bytes.is_some_and(|most| size > most) {
             return Err(self.error("is out of memory"));
         }
-        if let Some(planned) = &self.planned {
-            return Ok(planned.buffer(&self.device, size));
-        }
+        let size = if self.plans_only { BUFFER_MIN } else { size };
         let buffer = self.device.create_buffer(&wgpu::BufferDescriptor {
             label: Some(label),
             size,
@@ -48,11 +46,6 @@ impl Gpu {
         }
         self.check()?;
         Ok(buffer)
-    }
-
-    /// Size of a buffer, that it would have where it is only planned.
-    pub(in crate::gpu) fn size_of(&self, buffer: &wgpu::Buffer) -> u64 {
-        self.planned.as_ref().and_then(|planned| planned.size(buffer)).unwrap_or(buffer.size())
     }
 
     /// Checks that a buffer can be bound whole.
@@ -97,7 +90,7 @@ impl Gpu {
     /// Overwrites a part of a buffer.
     pub(in crate::gpu) fn write(&self, buffer: &wgpu::Buffer, offset: u64, bytes: &[u8]) {
         self.count_host(bytes.len() as u64);
-        if self.planned.is_none() {
+        if !self.plans_only {
             self.queue.write_buffer(buffer, offset, bytes);
         }
     }

@@ -2,7 +2,6 @@
 
 use std::num::NonZeroU64;
 use std::ops::Range;
-use std::sync::Arc;
 
 use rayon::prelude::*;
 
@@ -29,11 +28,6 @@ impl<'a> Bound<'a> {
     pub fn part(buffer: &'a wgpu::Buffer, bytes: Range<u64>) -> Self {
         Self { buffer, bytes: Some(bytes) }
     }
-
-    /// Bytes that are bound.
-    fn size(&self, gpu: &Gpu) -> u64 {
-        self.bytes.as_ref().map_or_else(|| gpu.size_of(self.buffer), |b| b.end - b.start)
-    }
 }
 
 /// How many workgroups a dispatch has.
@@ -57,9 +51,7 @@ pub(in crate::gpu) enum Op {
     /// Runs a kernel.
     Dispatch {
         kernel: Kernel,
-        /// Bytes of each binding, in the order of their numbers.
-        bound: Arc<[u64]>,
-        /// None where work is only planned.
+        /// None if work is only planned.
         run: Option<(wgpu::ComputePipeline, wgpu::BindGroup)>,
         groups: Groups,
     },
@@ -121,9 +113,8 @@ impl Gpu {
         groups: impl Into<Groups>,
     ) -> Op {
         let groups = groups.into();
-        let bound = bindings.iter().map(|bound| bound.size(self)).collect();
-        if self.planned.is_some() {
-            return Op::Dispatch { kernel, bound, run: None, groups };
+        if self.plans_only {
+            return Op::Dispatch { kernel, run: None, groups };
         }
         let entries: Vec<_> = bindings
             .iter()
@@ -144,7 +135,7 @@ impl Gpu {
             layout,
             entries: &entries,
         });
-        Op::Dispatch { kernel, bound, run: Some((pipeline.clone(), bind_group)), groups }
+        Op::Dispatch { kernel, run: Some((pipeline.clone(), bind_group)), groups }
     }
 
     /// Workgroups for `count` invocations or tiles, spilling into y past the limit of x.

@@ -6,7 +6,6 @@ mod buffers;
 mod commands;
 mod injected;
 mod limits;
-mod planned;
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
@@ -37,8 +36,8 @@ pub struct Gpu {
     injected: Injected,
     /// Submissions until one fails, that one included; 0 where none will.
     submissions_left: AtomicU64,
-    /// Where work is planned and not done.
-    planned: Option<planned::Planned>,
+    /// Whether work is only planned: buffers take no memory and nothing runs.
+    plans_only: bool,
     /// Buffers, bind groups and pipelines made so far, and the buffers' bytes.
     made: [AtomicU64; 2],
     /// Bytes that went between host and device so far.
@@ -111,7 +110,7 @@ impl Gpu {
         self.list_limit = list_limit(false, false);
         self.binding_limit = binding_limit;
         self.groups_max = GROUPS_MAX;
-        self.planned = Some(planned::Planned::default());
+        self.plans_only = true;
         self
     }
 

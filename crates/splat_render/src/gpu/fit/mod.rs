@@ -42,7 +42,7 @@ use crate::sh;
 use crate::stages::ProjectOptions;
 use crate::target::{Target, Weight};
 use frame::{Frame, Parts, Uniforms};
-pub use plan::{PlannedFit, StepWork};
+pub use plan::PlannedFit;
 use scene::{Scene, pair_buffers};
 
 /// Steps that may be under way before the host looks whether all pairs fitted.
