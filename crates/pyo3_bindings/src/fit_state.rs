@@ -1,4 +1,4 @@
-//! Everything a fit needs to go on, as dicts of numpy arrays: splats, optimiser moments, cameras.
+//! Everything a fit needs to go on, as dicts of numpy arrays: splats, optimizer moments, cameras.
 
 use glam::DMat4;
 use pyo3::prelude::*;

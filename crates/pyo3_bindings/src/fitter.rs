@@ -180,7 +180,7 @@ impl Fitter {
     }
 }
 
-/// One round splat per point, as large as the mean distance to its three nearest neighbours.
+/// One round splat per point, as large as the mean distance to its three nearest neighbors.
 #[pyfunction]
 pub fn splats_from_points<'py>(
     py: Python<'py>,

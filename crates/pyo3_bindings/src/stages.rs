@@ -40,7 +40,7 @@ pub const PARAMETERS: [&str; 5] = ["means", "quats", "scales", "opacities", "col
 
 /// Arguments of `project` and `project_backward` besides the parameters.
 pub struct View {
-    /// None: colours are given, not coefficients.
+    /// None: colors are given, not coefficients.
     pub sh_degree: Option<u32>,
     /// Whether scales are logarithms and opacities logits.
     pub raw_parameters: bool,

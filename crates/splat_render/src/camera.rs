@@ -1,4 +1,4 @@
-//! Pinhole cameras: OpenCV axes (x right, y down, z forward), pixel centres at +0.5.
+//! Pinhole cameras: OpenCV axes (x right, y down, z forward), pixel centers at +0.5.
 
 use glam::{DMat3, DMat4, DVec3};
 
@@ -79,7 +79,7 @@ impl Camera {
         self.viewmat.w_axis.truncate()
     }
 
-    /// Camera centre in the world frame.
+    /// Camera center in the world frame.
     pub fn center(&self) -> DVec3 {
         -(self.rotation().transpose() * self.translation())
     }

@@ -20,7 +20,7 @@ pub const ALPHA_MAX: f32 = 0.99;
 pub const TRANSMITTANCE_MIN: f32 = 1e-4;
 
 /// Default variance in px^2 added to both axes of every 2D covariance (EWA low-pass; gsplat's
-/// `eps2d`), so that no splat falls between pixel centres.
+/// `eps2d`), so that no splat falls between pixel centers.
 pub const BLUR: f32 = 0.3;
 
 /// Default near plane in world units, as gsplat's.

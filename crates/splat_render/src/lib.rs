@@ -8,20 +8,20 @@
 //! |---|---|---|
 //! | project | splats ([`SplatParams`]), [`Camera`] | 2D splats ([`Projected`]) |
 //! | bin | 2D splats | lists of splats per tile, inside the two rasterize stages |
-//! | rasterize | 2D splats, background | [`Image`]: colour, alpha, depth |
-//! | exposure | image, gain and offset ([`stages::Exposure`]) | the image's colours as a photo has them |
+//! | rasterize | 2D splats, background | [`Image`]: color, alpha, depth |
+//! | exposure | image, gain and offset ([`stages::Exposure`]) | the image's colors as a photo has them |
 //! | loss | image, photo ([`target::Target`]) | L1 and D-SSIM, and the image's gradient |
-//! | exposure_backward | gradient of those colours | gradients of image, gain and offset |
+//! | exposure_backward | gradient of those colors | gradients of image, gain and offset |
 //! | rasterize_backward | the image's gradient | gradients of the 2D splats |
 //! | project_backward | gradients of the 2D splats | gradients of splats and camera |
-//! | adam | gradients of the splats | splats after one optimiser step |
+//! | adam | gradients of the splats | splats after one optimizer step |
 //!
 //! [`fit`] runs them in a loop on a [`fit::FitDevice`], which keeps splats and photos where its kernels
 //! run. [`gpu_check`] opens a GPU that is known to compute right. [`io`] reads and writes files of splats and pictures,
 //! and [`levels`] scenes in levels of detail.
 //!
 //! Frames: the world is the scene's own, less an f64 origin that its files keep; cameras are OpenCV's
-//! (x right, y down, z forward), pixel centres at +0.5. Errors are [`Error`].
+//! (x right, y down, z forward), pixel centers at +0.5. Errors are [`Error`].
 
 pub mod camera;
 pub mod constants;

@@ -6,10 +6,10 @@ use crate::constants::{SH_COEFFS_MAX, SH_DEGREE_MAX};
 use crate::error::{Error, Result};
 use crate::sh;
 
-/// Colour of each splat.
+/// Color of each splat.
 #[derive(Debug, Clone, Copy)]
 pub enum Colors<'a, T> {
-    /// Spherical harmonics; colour = max(0, 0.5 + SH(direction from the camera to the mean)).
+    /// Spherical harmonics; color = max(0, 0.5 + SH(direction from the camera to the mean)).
     Sh {
         /// Degree that is evaluated, 0..=4; may be lower than what is stored.
         degree: u32,
@@ -18,22 +18,22 @@ pub enum Colors<'a, T> {
         /// `[N * stride]` RGB coefficients, splat-major.
         coeffs: &'a [[T; 3]],
     },
-    /// `[N]` colours that do not depend on the view, used as they are.
+    /// `[N]` colors that do not depend on the view, used as they are.
     Direct(&'a [[T; 3]]),
 }
 
 /// Parameters of N splats, borrowed.
 #[derive(Debug, Clone, Copy)]
 pub struct SplatParams<'a, T> {
-    /// `[N]` centres in the world frame (less the scene's origin).
+    /// `[N]` centers in the world frame (less the scene's origin).
     pub means: &'a [[T; 3]],
-    /// `[N]` rotations as wxyz quaternions, normalised inside.
+    /// `[N]` rotations as wxyz quaternions, normalized inside.
     pub quats: &'a [[T; 4]],
     /// `[N]` standard deviations along the splat's axes: logs if `raw`, else themselves.
     pub scales: &'a [[T; 3]],
     /// `[N]` opacities: logits if `raw`, else themselves.
     pub opacities: &'a [T],
-    /// Colours.
+    /// Colors.
     pub colors: Colors<'a, T>,
     /// Whether `scales` are logarithms and `opacities` logits (as fitted and stored).
     pub raw: bool,
@@ -94,9 +94,9 @@ impl<T> SplatParams<'_, T> {
 /// Parameters of N splats as they are fitted and stored. The same layout holds Adam's moments.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct SplatArrays<T = f32> {
-    /// `[N]` centres, world frame less the scene's origin.
+    /// `[N]` centers, world frame less the scene's origin.
     pub means: Vec<[T; 3]>,
-    /// `[N]` wxyz, not normalised.
+    /// `[N]` wxyz, not normalized.
     pub quats: Vec<[T; 4]>,
     /// `[N]` logarithms of the standard deviations.
     pub scales: Vec<[T; 3]>,
@@ -180,12 +180,12 @@ pub(crate) struct SplatSlices<'a> {
     pub quats: &'a mut [[f32; 4]],
     pub scales: &'a mut [[f32; 3]],
     pub opacities: &'a mut [f32],
-    /// Rows of colour, equally many per splat.
+    /// Rows of color, equally many per splat.
     pub sh: &'a mut [[f32; 3]],
 }
 
 impl<'a> SplatSlices<'a> {
-    /// The first `n` splats, of equally many rows of colour each.
+    /// The first `n` splats, of equally many rows of color each.
     pub fn first(self, n: usize) -> SplatSlices<'a> {
         let stride = self.sh.len() / self.means.len().max(1);
         SplatSlices {
@@ -210,7 +210,7 @@ impl<'a> SplatSlices<'a> {
         }
     }
 
-    /// Runs of `size` splats, in order, the last one shorter; each splat has `stride` rows of colour.
+    /// Runs of `size` splats, in order, the last one shorter; each splat has `stride` rows of color.
     pub fn into_blocks(
         self,
         size: usize,

@@ -135,7 +135,7 @@ impl Target {
 
     /// The photo with each `by` x `by` pixels averaged into one; rows and columns left over are dropped.
     ///
-    /// Colours are weighted by alpha and by the weights, which are averaged themselves. The depth is
+    /// Colors are weighted by alpha and by the weights, which are averaged themselves. The depth is
     /// that of a pixel in the middle: a mean over an edge is on no surface.
     pub fn reduced(&self, by: u32) -> Self {
         let (width, height) = (self.width / by, self.height / by);
@@ -247,7 +247,7 @@ mod tests {
         pixels[12..16].copy_from_slice(&[40, 100, 50, 255]);
         let weights = vec![1.0, 1.0, 0.0, 1.0, 0.0, 0.0];
         let clear = photo(4, pixels, Some(weights)).reduced(2);
-        // Neither the transparent pixel's colour counts nor that of the one of weight 0.
+        // Neither the transparent pixel's color counts nor that of the one of weight 0.
         assert_eq!(clear.pixels, [20, 100, 50, 170]);
         assert_eq!(clear.weights, Some(vec![0.75]));
         clear.validate(0).unwrap();

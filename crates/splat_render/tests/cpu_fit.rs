@@ -282,7 +282,7 @@ fn the_camera_gradient_is_the_slope_of_the_loss() {
     let mut device = CpuFit::default();
     device.set_targets(targets).unwrap();
     let mut state = start(1);
-    // Smooth where the loss is probed: large splats, far from the photo's colours.
+    // Smooth where the loss is probed: large splats, far from the photo's colors.
     state.splats.scales.iter_mut().for_each(|s| *s = s.map(|v| v + 1.5));
     state.splats.opacities.iter_mut().for_each(|o| *o = -1.0);
     state.splats.sh.iter_mut().for_each(|c| *c = c.map(|v| v + 0.3));

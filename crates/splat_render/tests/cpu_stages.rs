@@ -147,27 +147,27 @@ fn a_far_away_scene_renders_as_one_at_the_origin() {
 
 #[test]
 fn depth_loss_matches_the_reference() {
-    common::optimisation::depth_loss_matches_the_reference(&Cpu);
+    common::optimization::depth_loss_matches_the_reference(&Cpu);
 }
 
 #[test]
 fn exposure_matches_the_reference() {
-    common::optimisation::exposure_matches_the_reference(&Cpu);
+    common::optimization::exposure_matches_the_reference(&Cpu);
 }
 
 #[test]
 fn loss_matches_the_reference() {
-    common::optimisation::loss_matches_the_reference(&Cpu);
+    common::optimization::loss_matches_the_reference(&Cpu);
 }
 
 #[test]
 fn adam_matches_the_reference() {
-    common::optimisation::adam_matches_the_reference(&Cpu);
+    common::optimization::adam_matches_the_reference(&Cpu);
 }
 
 #[test]
 fn frozen_splats_keep_their_moments() {
-    common::optimisation::frozen_splats_keep_their_moments(&Cpu);
+    common::optimization::frozen_splats_keep_their_moments(&Cpu);
 }
 
 #[test]

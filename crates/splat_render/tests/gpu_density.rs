@@ -129,7 +129,7 @@ fn little_goes_between_host_and_device() {
         traffic.push(gpu.host_bytes() - before);
     }
     println!("bytes of each run: {traffic:?}");
-    // A sample of at most 10 000 centres, and tables: no more for more splats.
+    // A sample of at most 10 000 centers, and tables: no more for more splats.
     assert_eq!(traffic[1], traffic[2]);
     assert!(traffic[0].abs_diff(traffic[1]) < 1000, "{traffic:?}");
     assert!(traffic[0] < 1_000_000, "{traffic:?}");

@@ -457,7 +457,7 @@ fn running_out_of_room_for_pairs_changes_nothing() {
     let small = gpu().with_binding_limit(128 * 96 * 48);
     let (parts, losses_parts) = run(&mut GpuFit::new(Arc::new(small)), &capture, 20, 100.0);
     assert!(whole == parts && losses == losses_parts, "a smaller device gave other bits");
-    // Steps that are done again do not move colours twice.
+    // Steps that are done again do not move colors twice.
     let (dense, _) = run(&mut gpu_fit().with_color_wait(1), &capture, 20, 100.0);
     assert!(whole == dense, "waiting for room changed bits");
 }
@@ -503,7 +503,7 @@ fn steps_allocate_nothing_and_memory_grows_as_stated() {
     };
     let (few, many) = (1500, 3000);
     let per_splat = (bytes_of(many) - bytes_of(few)) as f64 / (many - few) as f64;
-    // 11 floats of geometry and 12 of colour (SH 1): values and two moments; notes, 2D splat and its
+    // 11 floats of geometry and 12 of color (SH 1): values and two moments; notes, 2D splat and its
     // gradient, depth keys, order and offsets; room for 4 pairs of 60 bytes.
     let parameters = 3.0 * (11.0 + 12.0);
     let stated = 4.0 * (parameters + 9.0 + 12.0 + 10.0 + 2.0 + 2.0 + 1.0) + 4.0 * 60.0;

@@ -141,7 +141,7 @@ fn parts_of_the_work_give_the_same_bits() {
         let v = gpu.project_backward(&scene.params(), &camera, &options, &projected, &v2d).unwrap();
         (projected, image, v2d, splat_gradient_bits(&v))
     };
-    // What the picture itself needs; it holds the colours of 704 splats and the gradient slots of
+    // What the picture itself needs; it holds the colors of 704 splats and the gradient slots of
     // 4 500 pairs.
     let whole = run(gpu());
     let parts = run(&Gpu::new(true).unwrap().with_binding_limit(216_000));
@@ -151,7 +151,7 @@ fn parts_of_the_work_give_the_same_bits() {
     assert!(whole == spilled, "workgroups in a second dimension changed the result");
 }
 
-/// Columns of a resident picture: colour without background, transmittance.
+/// Columns of a resident picture: color without background, transmittance.
 fn resident_picture(
     gpu: &Gpu,
     picture: &mut ResidentPicture,
@@ -194,7 +194,7 @@ fn resident_pictures_are_those_of_the_stages() {
             let expected = picture_by_stages(gpu, &scene, camera);
             let drawn = draw(camera, 0..camera.width).unwrap();
             assert!(drawn == expected, "not the stages' picture");
-            // Tiles lie elsewhere, and centres are rounded otherwise.
+            // Tiles lie elsewhere, and centers are rounded otherwise.
             let part = draw(camera, 21..camera.width - 5).unwrap();
             let row = |row: &[[f32; 4]]| row[21..camera.width as usize - 5].to_vec();
             let cut: Vec<_> = expected.chunks(camera.width as usize).flat_map(row).collect();
@@ -322,29 +322,29 @@ fn drawn_pictures_match_the_reference() {
 
 #[test]
 fn depth_loss_matches_the_reference() {
-    common::optimisation::depth_loss_matches_the_reference(gpu());
+    common::optimization::depth_loss_matches_the_reference(gpu());
 }
 
 #[test]
 fn exposure_matches_the_reference() {
-    common::optimisation::exposure_matches_the_reference(gpu());
+    common::optimization::exposure_matches_the_reference(gpu());
 }
 
 #[test]
 fn loss_matches_the_reference() {
     for gpu in [gpu(), discrete()] {
-        common::optimisation::loss_matches_the_reference(gpu);
+        common::optimization::loss_matches_the_reference(gpu);
     }
 }
 
 #[test]
 fn adam_matches_the_reference() {
-    common::optimisation::adam_matches_the_reference(gpu());
+    common::optimization::adam_matches_the_reference(gpu());
 }
 
 #[test]
 fn frozen_splats_keep_their_moments() {
-    common::optimisation::frozen_splats_keep_their_moments(gpu());
+    common::optimization::frozen_splats_keep_their_moments(gpu());
 }
 
 #[test]

@@ -35,7 +35,7 @@ struct Scene {
     scales: Vec<[f64; 3]>,
     opacities: Vec<f64>,
     colors: Vec<[f64; 3]>,
-    /// None: direct colours.
+    /// None: direct colors.
     degree: Option<u32>,
     raw: bool,
     antialiased: bool,
@@ -297,7 +297,7 @@ fn the_loss_s_gradient_matches_central_differences() {
             };
             let (high, low, _) = (at(value + 1e-6), at(value - 1e-6), at(value));
             let error = ((high - low) / 2e-6 - analytic[pixel][c]).abs() / largest;
-            // Within a step of the photo's colour the distance has its kink; bytes are that far
+            // Within a step of the photo's color the distance has its kink; bytes are that far
             // from random numbers.
             assert!(error <= 1e-6, "seed {seed}, pixel {pixel}, channel {c}: {error:.1e}");
             worst = worst.max(error);
@@ -316,7 +316,7 @@ fn the_exposure_s_gradients_match_central_differences() {
         let mut rng = Pcg64Mcg::seed_from_u64(seed ^ 0xe5e);
         image.transmittance.iter_mut().for_each(|t| *t = rng.random());
         let background = [0.2, 0.7, 0.4];
-        // So that no colour is cut.
+        // So that no color is cut.
         let mut exposure = Exposure {
             gain: std::array::from_fn(|_| rng.random_range(0.4..0.8)),
             offset: std::array::from_fn(|_| rng.random_range(0.02..0.15)),
@@ -474,7 +474,7 @@ fn a_depth_loss_has_its_bounds() {
 }
 
 #[test]
-fn a_cut_colour_is_only_brought_back() {
+fn a_cut_color_is_only_brought_back() {
     let image = Image {
         width: 4,
         height: 1,
@@ -495,9 +495,9 @@ fn a_cut_colour_is_only_brought_back() {
 }
 
 /// With first moments that keep nothing but the gradient, a step goes along it: what adam takes for
-/// the regularisers' gradients is read off and held against differences of the regularisers.
+/// the regularizers' gradients is read off and held against differences of the regularizers.
 #[test]
-fn the_regularisers_pull_along_their_gradients() {
+fn the_regularizers_pull_along_their_gradients() {
     let mut rng = Pcg64Mcg::seed_from_u64(5);
     let n = 9;
     let mut splats = SplatArrays {
@@ -537,7 +537,7 @@ fn the_regularisers_pull_along_their_gradients() {
     };
     Reference.adam(&mut state, &gradients, &step).unwrap();
     // 0.25 times the mean opacity and 0.5 times the mean scale.
-    let regularisers = |splats: &SplatArrays<f64>| {
+    let regularizers = |splats: &SplatArrays<f64>| {
         let opacities: f64 = splats.opacities.iter().map(|o| 1.0 / (1.0 + (-o).exp())).sum();
         let scales: f64 = splats.scales.as_flattened().iter().map(|s| s.exp()).sum();
         0.25 * opacities / n as f64 + 0.5 * scales / (3 * n) as f64
@@ -548,7 +548,7 @@ fn the_regularisers_pull_along_their_gradients() {
             let at = |splats: &mut SplatArrays<f64>, by: f64| {
                 let value = if k < 3 { &mut splats.scales[i][k] } else { &mut splats.opacities[i] };
                 *value += by;
-                let sum = regularisers(splats);
+                let sum = regularizers(splats);
                 let value = if k < 3 { &mut splats.scales[i][k] } else { &mut splats.opacities[i] };
                 *value -= by;
                 sum

@@ -3,7 +3,7 @@
 mod common;
 
 use common::narrowed::Narrowed;
-use common::{agreement, hard_cases, optimisation, properties};
+use common::{agreement, hard_cases, optimization, properties};
 
 #[test]
 fn no_splats_give_the_background() {
@@ -47,13 +47,13 @@ fn a_far_away_scene_renders_as_one_at_the_origin() {
 
 #[test]
 fn exposure_gets_through_what_the_others_must() {
-    optimisation::exposure_matches_the_reference(&Narrowed);
-    optimisation::depth_loss_matches_the_reference(&Narrowed);
+    optimization::exposure_matches_the_reference(&Narrowed);
+    optimization::depth_loss_matches_the_reference(&Narrowed);
 }
 
 #[test]
 fn frozen_splats_keep_their_moments() {
-    optimisation::frozen_splats_keep_their_moments(&Narrowed);
+    optimization::frozen_splats_keep_their_moments(&Narrowed);
 }
 
 #[test]

@@ -37,11 +37,11 @@ View:
   --cameras PATH       cameras.json of igsr, or a folder with one; default: that of the fit which
                        SCENE is of. For COLMAP and transforms.json use: igsr view SCENE --cameras PATH
   --camera N           start at camera N of the capture, from 0; default: 0, where there are cameras
-  --orbit DEG          turn about the scene's centre; with --frames: the number of pictures
+  --orbit DEG          turn about the scene's center; with --frames: the number of pictures
   --up AXIS            up axis: x, y, z, -x, -y or -z; default: from the cameras, else estimated
   --fov DEG            vertical field of view, 5 to 150; default 50
   --near DISTANCE      near plane; default 0.01, or a 20th of a smaller scene's radius
-  --background COLOR   white, black, grey or R,G,B in 0..1; default: the fit's, else black
+  --background COLOR   white, black, gray or R,G,B in 0..1; default: the fit's, else black
 
   --help, --version";
 
@@ -79,7 +79,7 @@ pub struct Arguments {
     pub budget: Option<usize>,
     /// Number of the camera to start at.
     pub camera: Option<usize>,
-    /// Degrees about the scene's centre, or a number of pictures.
+    /// Degrees about the scene's center, or a number of pictures.
     pub orbit: Option<f64>,
     /// The up axis, a unit vector.
     pub up: Option<[f64; 3]>,
@@ -288,9 +288,9 @@ fn axis(value: &OsString) -> Result<[f64; 3]> {
 
 fn color(value: &OsString) -> Result<[f32; 3]> {
     let text = text("--background", value)?;
-    let named = [("black", 0.0), ("white", 1.0), ("grey", 0.5)];
-    if let Some((_, grey)) = named.iter().find(|(name, _)| *name == text) {
-        return Ok([*grey; 3]);
+    let named = [("black", 0.0), ("white", 1.0), ("gray", 0.5)];
+    if let Some((_, gray)) = named.iter().find(|(name, _)| *name == text) {
+        return Ok([*gray; 3]);
     }
     let parts: Vec<f32> = text.split(',').filter_map(|part| part.trim().parse().ok()).collect();
     match parts[..] {
@@ -298,7 +298,7 @@ fn color(value: &OsString) -> Result<[f32; 3]> {
         _ => Err(Error::argument(
             "--background",
             format!(
-                "must be white, black, grey or three numbers in 0..1 such as 0.2,0.2,0.2, not \
+                "must be white, black, gray or three numbers in 0..1 such as 0.2,0.2,0.2, not \
                  {text:?}"
             ),
         )),

@@ -31,7 +31,7 @@ const ELLIPSE = 1.5;
 
 struct Corner {
     @builtin(position) position: vec4<f32>,
-    // Place relative to the centre, in standard deviations; for points in radii.
+    // Place relative to the center, in standard deviations; for points in radii.
     @location(0) whitened: vec2<f32>,
     @location(1) @interpolate(flat) color: vec3<f32>,
     @location(2) @interpolate(flat) opacity: f32,
@@ -110,7 +110,7 @@ fn shade(in: Corner) -> @location(0) vec4<f32> {
         if square > ELLIPSE * ELLIPSE {
             discard;
         }
-        // Darker towards the rim, so that neighbours can be told apart.
+        // Darker towards the rim, so that neighbors can be told apart.
         return vec4(in.color * (1.0 - 0.7 * square / (ELLIPSE * ELLIPSE)), 1.0);
     }
     let alpha = min(in.opacity * exp(-0.5 * square), ALPHA_MAX);

@@ -13,7 +13,7 @@ pub struct CameraPath {
     pub keys: Vec<Viewpoint>,
 }
 
-/// Cubic through b and c, with the slopes of their neighbours (Catmull and Rom 1974).
+/// Cubic through b and c, with the slopes of their neighbors (Catmull and Rom 1974).
 fn cubic(a: DVec3, b: DVec3, c: DVec3, d: DVec3, t: f64) -> DVec3 {
     let (t2, t3) = (t * t, t * t * t);
     0.5 * (2.0 * b

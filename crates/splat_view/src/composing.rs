@@ -16,7 +16,7 @@ pub struct Look {
     pub divider: f32,
     /// 1 where the canvases hold depths.
     pub is_depth: u32,
-    /// Depths at the ends of the colour map, in the canvases' unit.
+    /// Depths at the ends of the color map, in the canvases' unit.
     pub depth_range: [f32; 2],
     /// Fills the struct up to its size in WGSL.
     pub padding: f32,

@@ -11,7 +11,7 @@ pub enum Display {
     Points,
     /// Each as a solid ellipse, 1.5 standard deviations wide.
     Ellipses,
-    /// Expected depth in false colour.
+    /// Expected depth in false color.
     Depth,
     /// Each splat's shortest axis, in camera axes.
     Normals,

@@ -147,7 +147,7 @@ impl Scene {
         Ok(())
     }
 
-    /// The camera, turned by degrees about the scene's centre.
+    /// The camera, turned by degrees about the scene's center.
     fn turned(&self, degrees: f64) -> Camera {
         let mut viewpoint = self.viewpoint;
         viewpoint.orbit(degrees.to_radians(), 0.0, self.up);

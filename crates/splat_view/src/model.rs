@@ -19,9 +19,9 @@ const SAMPLES: usize = 100_000;
 pub struct Model {
     /// Its splats and their origin.
     pub file: SplatFile,
-    /// Centre of the visible splats, in world coordinates.
+    /// Center of the visible splats, in world coordinates.
     pub center: DVec3,
-    /// Radius about the centre: of 90% of the visible splats, at most four times that of 50%.
+    /// Radius about the center: of 90% of the visible splats, at most four times that of 50%.
     pub radius: f64,
     /// What was ignored in reading, one message each.
     pub notes: Vec<String>,
@@ -80,7 +80,7 @@ fn quantile(values: &mut [f64], part: f64) -> f64 {
     *values.select_nth_unstable_by(at, f64::total_cmp).1
 }
 
-/// Centre and radius. Medians, because captures have a few splats very far out.
+/// Center and radius. Medians, because captures have a few splats very far out.
 fn extent(file: &SplatFile) -> (DVec3, f64) {
     let step = file.splats.len().div_ceil(SAMPLES).max(1);
     let finite = (0..file.splats.len()).step_by(step).filter(|&i| is_finite(file, i));

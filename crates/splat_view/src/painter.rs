@@ -54,7 +54,7 @@ pub struct Shot<'a> {
     pub right: Option<&'a Drawable>,
     /// Where the right one begins, as a fraction of the width.
     pub divider: f32,
-    /// Depths at the ends of the colour map, world units.
+    /// Depths at the ends of the color map, world units.
     pub depths: [f32; 2],
 }
 

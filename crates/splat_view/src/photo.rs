@@ -19,7 +19,7 @@ const SIDE_MAX: usize = 16_384;
 pub struct Photo {
     /// Width and height in pixels.
     pub size: [usize; 2],
-    /// RGBA, row-major, colours not multiplied by alpha.
+    /// RGBA, row-major, colors not multiplied by alpha.
     pub rgba: Vec<u8>,
 }
 
@@ -49,7 +49,7 @@ impl Photo {
                     for pixel in self.rgba[from..from + 4 * columns.len()].chunks_exact(4) {
                         let alpha = u64::from(pixel[3]);
                         alphas += alpha;
-                        // Weighted by alpha: invisible pixels have no meaningful colour.
+                        // Weighted by alpha: invisible pixels have no meaningful color.
                         for (sum, &value) in sum.iter_mut().zip(pixel) {
                             *sum += alpha * u64::from(value);
                         }
@@ -152,10 +152,10 @@ mod tests {
     fn every_kind_of_png_becomes_rgba() {
         use png::BitDepth::{Eight, Sixteen};
         use png::ColorType::{Grayscale, GrayscaleAlpha, Indexed, Rgb, Rgba};
-        let grey = [7, 7, 7, 255, 9, 9, 9, 255];
+        let gray = [7, 7, 7, 255, 9, 9, 9, 255];
         let kinds: [(_, _, &[u8], [u8; 8]); 6] = [
-            (Grayscale, Eight, &[7, 9], grey),
-            (Grayscale, Sixteen, &[7, 7, 9, 9], grey),
+            (Grayscale, Eight, &[7, 9], gray),
+            (Grayscale, Sixteen, &[7, 7, 9, 9], gray),
             (GrayscaleAlpha, Eight, &[7, 1, 9, 2], [7, 7, 7, 1, 9, 9, 9, 2]),
             (Rgb, Eight, &[1, 2, 3, 4, 5, 6], [1, 2, 3, 255, 4, 5, 6, 255]),
             (Rgba, Eight, &[1, 2, 3, 4, 5, 6, 7, 8], [1, 2, 3, 4, 5, 6, 7, 8]),

@@ -68,7 +68,7 @@ impl Screen {
         let mut config = surface
             .get_default_config(&adapter, size.width.clamp(1, most), size.height.clamp(1, most))
             .ok_or_else(|| failed(format!("{} shows nothing in it", gpu.name())))?;
-        // Colours are encoded as they are shown, and egui blends them so.
+        // Colors are encoded as they are shown, and egui blends them so.
         let formats = surface.get_capabilities(&adapter).formats;
         config.format = formats.iter().copied().find(|f| !f.is_srgb()).unwrap_or(config.format);
         config.present_mode = wgpu::PresentMode::AutoVsync;
@@ -150,7 +150,7 @@ impl Screen {
     /// configured again.
     pub fn acquire(&self) -> Result<(Option<wgpu::SurfaceTexture>, bool)> {
         let current = match self.window.inner_size() {
-            // Minimised: there is nothing to draw on.
+            // Minimized: there is nothing to draw on.
             size if size.width == 0 || size.height == 0 => Current::Occluded,
             _ => self.surface.get_current_texture(),
         };

@@ -148,7 +148,7 @@ impl Viewer {
         }
     }
 
-    /// Centre and radius of what is shown.
+    /// Center and radius of what is shown.
     pub fn extent(&self) -> (DVec3, f64) {
         let shown = self.shown.iter().flatten().next();
         shown.map_or((DVec3::ZERO, 1.0), |shown| (shown.model.center, shown.model.radius))
@@ -203,7 +203,7 @@ impl Viewer {
         }
     }
 
-    /// Makes what is under a pixel the pivot of orbits and the centre of the picture. False if there is
+    /// Makes what is under a pixel the pivot of orbits and the center of the picture. False if there is
     /// nothing.
     pub fn focus(
         &mut self,

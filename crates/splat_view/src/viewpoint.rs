@@ -9,7 +9,7 @@ const POLE: f64 = 0.02;
 /// A camera's pose, with the pivot that orbits go about.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Viewpoint {
-    /// The camera's centre in the world.
+    /// The camera's center in the world.
     pub position: DVec3,
     /// From camera axes (x right, y down, z forward) to the world.
     pub rotation: DQuat,
@@ -108,7 +108,7 @@ impl Viewpoint {
         DMat4::from_quat(self.rotation.inverse()) * DMat4::from_translation(-self.position)
     }
 
-    /// A pinhole camera with the principal point at the centre; `fov` is vertical, in radians.
+    /// A pinhole camera with the principal point at the center; `fov` is vertical, in radians.
     pub fn camera(&self, [width, height]: [u32; 2], fov: f64) -> Camera {
         let focal = 0.5 * f64::from(height) / (0.5 * fov).tan();
         Camera {

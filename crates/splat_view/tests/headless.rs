@@ -62,7 +62,7 @@ fn a_capture_s_camera_draws_what_the_rasterizer_draws_on_cpu_and_gpu() {
 }
 
 #[test]
-fn exr_holds_colour_alpha_and_expected_depth() {
+fn exr_holds_color_alpha_and_expected_depth() {
     let folder = Folder::new();
     let (scene, out) = (folder.join("scene.ply"), folder.join("out.exr"));
     let file = ball(200, 2, [0.5; 3]);
@@ -457,7 +457,7 @@ fn every_format_opens_and_shows_the_scene() {
     };
     let expected = draw("scene.ply");
     assert!(expected.rgb.iter().any(|&v| v > 60), "the scene is dark");
-    // Largest mean differences, in 255ths: of .splat, which has no view-dependent colour, and of the
+    // Largest mean differences, in 255ths: of .splat, which has no view-dependent color, and of the
     // others, which round.
     let formats = [
         ("a.splat", 12.0),

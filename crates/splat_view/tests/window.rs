@@ -101,7 +101,7 @@ impl Xvfb {
             let word: [u8; 4] = bytes[4 * i..4 * i + 4].try_into().expect("a word");
             u32::from_be_bytes(word) as usize
         };
-        // XWD: size of the header, ..., bytes of a line (13th), ..., number of colours (20th).
+        // XWD: size of the header, ..., bytes of a line (13th), ..., number of colors (20th).
         let (start, line) = (word(0) + 12 * word(19), word(12));
         let pixel = |x: usize, y: usize| {
             let at = start + y * line + 4 * x;

@@ -1,4 +1,4 @@
-//! adam: one optimiser step of all parameters, a block of splats at a time.
+//! adam: one optimizer step of all parameters, a block of splats at a time.
 
 use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
@@ -83,10 +83,10 @@ pub(super) struct BlockStep {
     frozen: bool,
     rates: BlockRates,
     bias: [f32; 2],
-    /// Gradients of the regularisers by one opacity and one scale.
+    /// Gradients of the regularizers by one opacity and one scale.
     opacity_pull: f32,
     scale_pull: f32,
-    /// Floats of colour per splat: stored, and of the degree in use.
+    /// Floats of color per splat: stored, and of the degree in use.
     stored: usize,
     used: usize,
 }
@@ -107,7 +107,7 @@ impl BlockStep {
         }
     }
 
-    /// Adds the regularisers' gradients to those of a block of splats.
+    /// Adds the regularizers' gradients to those of a block of splats.
     pub fn pull(&self, values: &SplatSlices<'_>, gradients: &mut BlockGradients) {
         if self.opacity_pull == 0.0 && self.scale_pull == 0.0 {
             return;
@@ -122,7 +122,7 @@ impl BlockStep {
         });
     }
 
-    /// Moves a block of splats by its gradients, colours apart.
+    /// Moves a block of splats by its gradients, colors apart.
     pub fn apply(
         &self,
         values: &mut SplatSlices<'_>,
@@ -150,7 +150,7 @@ impl BlockStep {
         adam!(opacities);
     }
 
-    /// Moves the colours of a block of splats by their gradients.
+    /// Moves the colors of a block of splats by their gradients.
     fn apply_colors(
         &self,
         values: &mut SplatSlices<'_>,
@@ -294,7 +294,7 @@ impl<'a, S: Simd> StateVectors<'a, S> {
     }
 }
 
-/// What the regularisers pull at: log-scales and logits of a block, with their gradients.
+/// What the regularizers pull at: log-scales and logits of a block, with their gradients.
 struct Pull<'a> {
     log_scales: &'a [f32],
     v_scales: &'a mut [f32],

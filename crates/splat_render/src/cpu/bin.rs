@@ -35,7 +35,7 @@ impl ChunkTiles {
     }
 
     /// Appends the tiles that a visible splat touches: per row of tiles, the exact span of its
-    /// ellipse {alpha >= ALPHA_MIN} within the band of that row's pixel centres, a little widened
+    /// ellipse {alpha >= ALPHA_MIN} within the band of that row's pixel centers, a little widened
     /// against rounding.
     pub fn push(&mut self, splat: &Splat2d, width: u32, height: u32) {
         let before = self.tiles.len();
@@ -52,7 +52,7 @@ impl ChunkTiles {
         let reach = splat.reach * (1.0 + 1e-5) + 1e-5;
         let slack = |radius: f32, center: f32| 1e-2 + 4e-6 * (radius + center.abs());
         let (slack_x, slack_y) = (slack(rx, mx), slack(ry, my));
-        // The tiles whose pixel centres lie between two numbers. A tile's last pixel centre lies half
+        // The tiles whose pixel centers lie between two numbers. A tile's last pixel center lies half
         // a pixel before its end, hence the -0.5, and the +0.5 on the tile that ends there. The
         // clamp makes cutting off what rounding down is.
         let tiles_of = |low: f32, high: f32, count: u32| {
@@ -395,7 +395,7 @@ mod tests {
         assert!(needed > 10_000, "only {needed} tiles are reached");
         let excess = listed as f64 / needed as f64 - 1.0;
         println!("{listed} tiles listed, {needed} reached: {:.2} % too many", 100.0 * excess);
-        // Those that an ellipse enters between pixel centres only.
+        // Those that an ellipse enters between pixel centers only.
         assert!(excess < 0.03, "{listed} tiles are listed where {needed} are reached");
     }
 }

@@ -94,7 +94,7 @@ impl Ids {
     }
 }
 
-/// Parameters of a block of splats as they are given, colours apart.
+/// Parameters of a block of splats as they are given, colors apart.
 #[derive(Debug)]
 pub(super) struct SplatRows {
     pub means: [Row; 3],
@@ -137,7 +137,7 @@ impl SplatRows {
     }
 }
 
-/// Colour coefficients of a block of splats: row 3 k + c has channel c of coefficient k.
+/// Color coefficients of a block of splats: row 3 k + c has channel c of coefficient k.
 #[derive(Debug)]
 pub(super) struct ColorRows(pub [Row; 3 * SH_COEFFS_MAX]);
 

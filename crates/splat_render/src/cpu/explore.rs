@@ -40,7 +40,7 @@ impl ExploreBlock {
         })
     }
 
-    /// Moves the centres of a block of raw splats, the first of them splat `first_id` of the scene.
+    /// Moves the centers of a block of raw splats, the first of them splat `first_id` of the scene.
     pub fn run(&mut self, splats: &mut SplatSlices<'_>, noise: f32, seed: u32, first_id: usize) {
         dispatch(Explore { block: self, splats, noise, seed, first_id });
     }

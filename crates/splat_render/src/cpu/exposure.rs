@@ -1,4 +1,4 @@
-//! exposure and exposure_backward: a picture's colours as a photo of some gain and offset has them.
+//! exposure and exposure_backward: a picture's colors as a photo of some gain and offset has them.
 
 use rayon::prelude::*;
 
@@ -45,7 +45,7 @@ impl Exposed {
         }
     }
 
-    /// Turns the gradients of the corrected colours into those of the picture, in place, with
+    /// Turns the gradients of the corrected colors into those of the picture, in place, with
     /// `self.v_alpha`, and returns those of gain and offset.
     pub fn backward(
         &mut self,
@@ -140,7 +140,7 @@ fn matted_sums(v: &[f32], color: &[f32], t: &[f32], b: f32) -> [f64; 2] {
     sums.map(|lanes| lanes.iter().map(|&sum| f64::from(sum)).sum())
 }
 
-/// Colours and transmittances of a picture as planes.
+/// Colors and transmittances of a picture as planes.
 fn planes(image: &Image<f32>) -> Planes {
     let mut planes = Planes::default();
     planes.resize(image.width, image.height);

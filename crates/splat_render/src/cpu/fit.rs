@@ -33,7 +33,7 @@ use crate::target::Target;
 pub struct CpuFit {
     targets: Vec<Target>,
     state: FitState,
-    /// The steps that colours may be behind the other parameters, and where each splat's are.
+    /// The steps that colors may be behind the other parameters, and where each splat's are.
     steps: WaitingSteps,
     waiting: Vec<WaitingColor>,
     loss_value: f32,
@@ -264,14 +264,14 @@ struct Scratch {
 }
 
 impl CpuFit {
-    /// Colours of splats that are not seen wait for at most so many steps, by default
+    /// Colors of splats that are not seen wait for at most so many steps, by default
     /// [`COLOR_WAIT`](crate::fit::COLOR_WAIT); with 1, all are brought up to date in every step. Bits are
     /// the same.
     pub fn with_color_wait(self, steps: usize) -> Self {
         Self { steps: WaitingSteps::at_most(steps), ..self }
     }
 
-    /// Brings all colours up to date.
+    /// Brings all colors up to date.
     fn catch_up(&mut self) {
         if self.steps.get().is_empty() {
             return;
@@ -296,7 +296,7 @@ impl CpuFit {
         self.forget();
     }
 
-    /// Begins anew, from colours that are up to date.
+    /// Begins anew, from colors that are up to date.
     fn forget(&mut self) {
         self.steps.clear();
         self.waiting.clear();

@@ -208,7 +208,7 @@ pub(super) fn ellipses<S: Simd>(view: &View, scales: Vec3s<S>, g: &Geometry<S>) 
     }
 }
 
-/// Unit view direction in the world and the length it was normalised by.
+/// Unit view direction in the world and the length it was normalized by.
 #[inline(always)]
 pub(super) fn direction<S: Simd>(view: &View, t: Vec3s<S>) -> (Vec3s<S>, Lanes<S>) {
     let along = to_world(view.axes(t.x.simd()), t);
@@ -217,7 +217,7 @@ pub(super) fn direction<S: Simd>(view: &View, t: Vec3s<S>) -> (Vec3s<S>, Lanes<S
     (Vec3s::new(along.x / length, along.y / length, along.z / length), length)
 }
 
-/// SH colours before the cut at zero, of the vector `at` of a block's coefficients.
+/// SH colors before the cut at zero, of the vector `at` of a block's coefficients.
 #[inline(always)]
 pub(super) fn sh_color<S: Simd>(
     degree: u32,
@@ -241,7 +241,7 @@ pub(super) struct Splat2d {
     pub depth: f32,
     pub color: [f32; 3],
     pub opacity: f32,
-    /// The square of the distance from its centre, in standard deviations, where alpha is
+    /// The square of the distance from its center, in standard deviations, where alpha is
     /// `ALPHA_MIN`.
     pub reach: f32,
     pub radii: [f32; 2],
@@ -253,7 +253,7 @@ pub(super) struct ProjectBlock {
     /// Which splats of the block are projected; what follows has them in this order.
     ids: Ids,
     splats: SplatRows,
-    /// Camera-space centres.
+    /// Camera-space centers.
     t: [Row; 3],
     means2d: [Row; 2],
     factors: [Row; 3],
@@ -269,7 +269,7 @@ pub(super) struct ProjectBlock {
     visible_t: [Row; 3],
     coeffs: ColorRows,
     colors: [Row; 3],
-    /// 1 where the colour is finite.
+    /// 1 where the color is finite.
     finite: Row,
 }
 
@@ -295,7 +295,7 @@ impl ProjectBlock {
     }
 
     /// Projects the splats `ids` of the block that begins with splat `first`, with opacities
-    /// multiplied by `compensation`, but for their colours. Returns those that are visible as far as
+    /// multiplied by `compensation`, but for their colors. Returns those that are visible as far as
     /// their shape goes, by their numbers in the block.
     pub fn shapes(
         &mut self,
@@ -310,7 +310,7 @@ impl ProjectBlock {
         self.numbers
     }
 
-    /// The colours of the splats that [`ProjectBlock::shapes`] returned, of a block that begins with
+    /// The colors of the splats that [`ProjectBlock::shapes`] returned, of a block that begins with
     /// splat `first` of `colors`.
     pub fn colors(&mut self, view: &View, colors: Colors<'_, f32>, first: usize) {
         dispatch(Paint { block: self, view, colors, first });
@@ -384,7 +384,7 @@ impl WithSimd for Paint<'_> {
 }
 
 impl ProjectBlock {
-    /// Everything but the colours.
+    /// Everything but the colors.
     #[inline(always)]
     fn outline<S: Simd>(&mut self, s: S, view: &View, splats: &Splats<S>, at: usize) {
         let g = geometry(s, view, splats);
@@ -416,7 +416,7 @@ impl ProjectBlock {
         self.reaches.set(at, visible.keep(zero.all(1.0)));
     }
 
-    /// Colours of the visible splats.
+    /// Colors of the visible splats.
     #[inline(always)]
     fn paint<S: Simd>(&mut self, s: S, view: &View, colors: Colors<'_, f32>, first: usize) {
         let (places, numbers) = (self.visible.get(), self.numbers);

@@ -158,7 +158,7 @@ pub(super) struct BackwardBlock {
     v_depths: Row,
     v_colors2d: [Row; 3],
     v_opacities2d: Row,
-    // Gradients of the splats. Those of the coefficients are the basis times those of the colour.
+    // Gradients of the splats. Those of the coefficients are the basis times those of the color.
     v_means: [Row; 3],
     v_quats: [Row; 4],
     v_scales: [Row; 3],
@@ -170,8 +170,8 @@ pub(super) struct BackwardBlock {
     v_camera: CameraRows,
 }
 
-/// Gradient of a splat's colour before the cut at zero, and the direction it is seen along: the
-/// gradient of each coefficient is its basis function there times that of the colour.
+/// Gradient of a splat's color before the cut at zero, and the direction it is seen along: the
+/// gradient of each coefficient is its basis function there times that of the color.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct ColorGradient {
     pub v_color: [f32; 3],
@@ -224,13 +224,13 @@ impl BackwardBlock {
         self.v_opacities2d.0[at] = v.v_opacity;
     }
 
-    /// Writes the gradients of the splats that were pushed, colours apart, to `out`, the block's part
+    /// Writes the gradients of the splats that were pushed, colors apart, to `out`, the block's part
     /// of the arrays, and returns the camera's. The block begins with splat `first` of `stage.splats`.
     pub fn run(&mut self, stage: &Backward<'_>, first: usize, out: SplatSlices<'_>) -> VCamera {
         dispatch(Run { block: self, stage, first, out })
     }
 
-    /// Gradients of the colours of the splats that were pushed, with their numbers in the block.
+    /// Gradients of the colors of the splats that were pushed, with their numbers in the block.
     pub fn color_gradients(&self) -> impl Iterator<Item = (usize, ColorGradient)> {
         let of = |rows: &[Row; 3], at: usize| [rows[0].0[at], rows[1].0[at], rows[2].0[at]];
         self.ids.get().iter().enumerate().map(move |(at, &k)| {
@@ -295,7 +295,7 @@ impl BackwardBlock {
         let (jx, jy) = (inverse_z * view.focal.x, inverse_z * view.focal.y);
         let mut v_t = none;
 
-        // Colour and, through the view direction, t and the rotation.
+        // Color and, through the view direction, t and the rotation.
         let mut v_color = get3(&self.v_colors2d, s, at);
         let mut v_along = none;
         if let Colors::Sh { degree, .. } = *colors {
@@ -364,7 +364,7 @@ impl BackwardBlock {
         }
         let v_b = [v_m[0] * scales, v_m[1] * scales];
 
-        // Axes -> quaternion, through its normalisation.
+        // Axes -> quaternion, through its normalization.
         let v_axes = Mat3s([
             g.a[0].mul_add(v_b[0].x, g.a[1] * v_b[1].x),
             g.a[0].mul_add(v_b[0].y, g.a[1] * v_b[1].y),
@@ -393,7 +393,7 @@ impl BackwardBlock {
         v_t.y = v_t.y + by_y;
         v_t.z = v_t.z - by_x.mul_add(xz, by_y * yz);
 
-        // Centre and depth.
+        // Center and depth.
         let (v_u, v_v) = (self.v_means2d[0].get(s, at), self.v_means2d[1].get(s, at));
         let (x_z, y_z) = (g.t.x * inverse_z, g.t.y * inverse_z);
         let (v_x, v_y) = (v_u * jx, v_v * jy);
@@ -402,7 +402,7 @@ impl BackwardBlock {
         let v_mean = to_world([row_x, row_y, row_z], v_t);
 
         // A finite picture can still have gradients that overflow (a coefficient of 1e38, or -inf
-        // behind the cut of the colour). All of that splat's are zero then: they must not reach the
+        // behind the cut of the color). All of that splat's are zero then: they must not reach the
         // camera or, through Adam's moments, later steps.
         let mut finite = Finite::new(v_opacity);
         finite.add3(v_color);
@@ -451,7 +451,7 @@ impl BackwardBlock {
         intrinsics[3].set(at, kept.keep(v_cy));
     }
 
-    /// Writes what came out, in the parameters' layout, colours apart.
+    /// Writes what came out, in the parameters' layout, colors apart.
     #[inline(always)]
     fn write(&self, ids: &[u8], out: SplatSlices<'_>) {
         for (at, &k) in (0..BLOCK).zip(ids) {

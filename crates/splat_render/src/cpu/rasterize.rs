@@ -1,4 +1,4 @@
-//! rasterize: ids to colour, alpha, depth and final transmittance, a tile at a time.
+//! rasterize: ids to color, alpha, depth and final transmittance, a tile at a time.
 
 use std::sync::atomic::AtomicU32;
 

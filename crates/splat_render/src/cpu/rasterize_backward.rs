@@ -33,7 +33,7 @@ pub(super) const ABSOLUTE_SUMS: usize = 12;
 pub(super) struct PictureGradients<'a> {
     /// The forward pass's picture, over its background.
     pub image: &'a Planes,
-    /// Gradient of each colour channel, H x W.
+    /// Gradient of each color channel, H x W.
     pub v_color: &'a [Vec<f32>; 3],
     /// Gradient of alpha, if there is one.
     pub v_alpha: Option<&'a [f32]>,
@@ -214,7 +214,7 @@ pub(super) fn rasterize_backward_tiles<const N: usize>(
 }
 
 /// Adds up a splat's pairs, at these positions in tile order, and turns whitened moments into 2D
-/// gradients, with the absolute gradient of the centre where `N` has it.
+/// gradients, with the absolute gradient of the center where `N` has it.
 #[inline(always)]
 pub(super) fn gather<const N: usize>(
     splat: &TileSplat,
@@ -246,7 +246,7 @@ pub(super) fn gather<const N: usize>(
     (v, v_mean_absolute)
 }
 
-/// Gradients of all 2D splats, each with the absolute one of its centre where `N` has it.
+/// Gradients of all 2D splats, each with the absolute one of its center where `N` has it.
 fn gradients<const N: usize>(
     Binned { splats, bins }: &Binned,
     picture: PictureGradients<'_>,

@@ -1,7 +1,7 @@
 //! The SSIM window as two passes of 11 taps, and how a picture's rows lie in memory for them.
 //!
 //! A row is cut into as many equal parts as a vector has lanes, and vector k holds the k-th value of
-//! each part. So the neighbours of a vector's values along the row are the vectors beside it: both
+//! each part. So the neighbors of a vector's values along the row are the vectors beside it: both
 //! passes read whole, aligned vectors, where a row as it lies in the picture would be read across
 //! cache lines, once for each tap. Only where a part begins or ends do values come from the next
 //! lane.
@@ -12,9 +12,9 @@ use pulp::Simd;
 
 use crate::constants::SSIM_WINDOW;
 
-/// Taps on each side of the window's centre.
+/// Taps on each side of the window's center.
 pub(super) const HALF: usize = SSIM_WINDOW.len() / 2;
-/// Neighbouring results that are computed side by side, since they share most of what they read.
+/// Neighboring results that are computed side by side, since they share most of what they read.
 pub(super) const STEP: usize = 4;
 /// Values that so many results are made of.
 pub(super) const REACH: usize = STEP + 2 * HALF;
@@ -111,7 +111,7 @@ fn blocks(vectors: usize) -> impl Iterator<Item = usize> {
     (0..vectors.div_ceil(BLOCK)).map(move |block| (block * BLOCK).min(vectors - BLOCK))
 }
 
-/// Fills the [`HALF`] vectors before and after those of a row with the neighbouring parts' values,
+/// Fills the [`HALF`] vectors before and after those of a row with the neighboring parts' values,
 /// zero beyond the picture.
 #[inline(always)]
 pub(super) fn fill_ends<S: Simd>(s: S, row: &mut [S::f32s]) {
@@ -154,7 +154,7 @@ pub(super) fn many_registers<S: Simd>() -> bool {
     S::REGISTER_COUNT >= 32
 }
 
-/// [`STEP`] neighbouring results of a pass.
+/// [`STEP`] neighboring results of a pass.
 #[inline(always)]
 pub(super) fn filter_step<S: Simd>(s: S, values: &[S::f32s; REACH]) -> [S::f32s; STEP] {
     if many_registers::<S>() {
@@ -165,7 +165,7 @@ pub(super) fn filter_step<S: Simd>(s: S, values: &[S::f32s; REACH]) -> [S::f32s;
     [a, b, c, d]
 }
 
-/// `N` neighbouring results of a pass from their N + 2 [`HALF`] values.
+/// `N` neighboring results of a pass from their N + 2 [`HALF`] values.
 #[inline(always)]
 pub(super) fn filter<S: Simd, const N: usize>(s: S, values: &[S::f32s]) -> [S::f32s; N] {
     let values = &values[..N + 2 * HALF];

@@ -125,16 +125,16 @@ fn offset(row: usize, column: usize, lanes: usize) -> usize {
 /// Where a tile's pixels are in the picture.
 #[repr(align(64))]
 pub(super) struct Centers {
-    /// x of the pixel centres of each block of a row of blocks.
+    /// x of the pixel centers of each block of a row of blocks.
     x: [f32; 4 * WIDEST],
-    /// y of the pixel centres of each block of a column of blocks.
+    /// y of the pixel centers of each block of a column of blocks.
     y: [f32; 4 * WIDEST],
-    /// y of the rows' pixel centres.
+    /// y of the rows' pixel centers.
     rows: [f32; SIDE],
     /// For each block of a row of blocks, the bits in [`Vectors`] of those blocks below it that hold
     /// the rows of a vector's lanes.
     bits: [u32; 4 * WIDEST],
-    /// x of the first pixel centre.
+    /// x of the first pixel center.
     left: f32,
 }
 

@@ -1,6 +1,6 @@
-//! Colours that wait: a step leaves a splat's colours as they are and keeps their gradient, and when the
+//! Colors that wait: a step leaves a splat's colors as they are and keeps their gradient, and when the
 //! splat is next projected, that step and all that followed without a gradient are done in one go. So
-//! colours and moments of splats out of sight are neither read nor written; see `fit_device::waiting`.
+//! colors and moments of splats out of sight are neither read nor written; see `fit_device::waiting`.
 
 use pulp::{Simd, WithSimd};
 
@@ -13,7 +13,7 @@ use crate::constants::SH_COEFFS_MAX;
 use crate::fit_device::ColorStep;
 use crate::sh;
 
-/// How far a splat's colours are.
+/// How far a splat's colors are.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct WaitingColor {
     /// The first of the steps that they wait for.
@@ -24,17 +24,17 @@ pub(super) struct WaitingColor {
 }
 
 impl WaitingColor {
-    /// Takes the gradient of the step at hand; the colours are up to date but for it.
+    /// Takes the gradient of the step at hand; the colors are up to date but for it.
     pub fn add(&mut self, gradient: ColorGradient) {
         (self.has_gradient, self.gradient) = (true, gradient);
     }
 }
 
-/// The steps that colours wait for, as every block of splats takes them.
+/// The steps that colors wait for, as every block of splats takes them.
 pub(super) struct ColorPlan<'a> {
     steps: &'a [ColorStep],
     degree: u32,
-    /// Floats of colour per splat: stored, and of the degree in use.
+    /// Floats of color per splat: stored, and of the degree in use.
     stored: usize,
     used: usize,
     /// 1 for each float of a block that has the first coefficient's rate.
@@ -74,7 +74,7 @@ impl ColorBlock {
         })
     }
 
-    /// Does all steps that the splats `ids` of a block wait for. `arrays` are its colours with their
+    /// Does all steps that the splats `ids` of a block wait for. `arrays` are its colors with their
     /// first and second moments.
     pub fn run(
         &mut self,
@@ -160,7 +160,7 @@ impl WithSimd for CatchUp<'_, '_> {
         let ids = ids.get();
         let mut at = 0;
         while at < ids.len() {
-            // Neighbours that wait for the same steps go together, where no coefficient rests.
+            // Neighbors that wait for the same steps go together, where no coefficient rests.
             let (id, next) = (usize::from(ids[at]), waiting[usize::from(ids[at])].next);
             let mut count = 1;
             while plan.used == plan.stored

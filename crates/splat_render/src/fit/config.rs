@@ -5,7 +5,7 @@ use crate::constants::SH_DEGREE_MAX;
 use crate::error::{Error, Result};
 use crate::stages::Rates;
 
-/// MCMC's noise on the centres, in units of 3DGS's rate (the paper's).
+/// MCMC's noise on the centers, in units of 3DGS's rate (the paper's).
 const MCMC_NOISE: f32 = 5e5;
 
 /// How the number of splats is controlled.
@@ -24,16 +24,16 @@ pub enum DensityControl {
 /// Background of renders and of photos with alpha.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Background {
-    /// A new colour in every step for photos with alpha; black for photos without.
+    /// A new color in every step for photos with alpha; black for photos without.
     Random,
-    /// One colour, RGB in 0..1.
+    /// One color, RGB in 0..1.
     Color([f32; 3]),
 }
 
 /// Settings of a fit. Rates are those of 3DGS unless said otherwise.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FitConfig {
-    /// Number of steps of the whole fit; the centres' rate decays over it.
+    /// Number of steps of the whole fit; the centers' rate decays over it.
     pub steps: u32,
     /// The step that moments began at, above 0 where a fit enters the schedule with splats of another.
     pub first_step: u32,
@@ -51,11 +51,11 @@ pub struct FitConfig {
     pub background: Background,
     /// Weight of D-SSIM in the loss.
     pub ssim_weight: f32,
-    /// Adam's rates at the end; that of the centres before `means_decay`, in units of the scene's
+    /// Adam's rates at the end; that of the centers before `means_decay`, in units of the scene's
     /// extent.
     pub rates: Rates,
     /// What the first half of the steps multiplies all rates by; the factor then falls to 1, but for
-    /// the centres, whose rate decays by itself. See [`FitConfig::rates_at`].
+    /// the centers, whose rate decays by itself. See [`FitConfig::rates_at`].
     pub rate_scale: f32,
     /// Part of the splats that a step leaves out at random, growing from none in the first step to
     /// this in the last (DropGaussian).
@@ -70,7 +70,7 @@ pub struct FitConfig {
     /// What the loss of photos' depths is multiplied by in the first step; see
     /// [`FitConfig::depth_weight_at`].
     pub depth_weight: f32,
-    /// What the centres' rate has decayed to at the end, as a part of the start's.
+    /// What the centers' rate has decayed to at the end, as a part of the start's.
     pub means_decay: f32,
 }
 
@@ -156,9 +156,9 @@ impl FitConfig {
         }
     }
 
-    /// Size of MCMC's noise on centres in a step, from 0, of a scene of this extent; 0 elsewhere.
+    /// Size of MCMC's noise on centers in a step, from 0, of a scene of this extent; 0 elsewhere.
     ///
-    /// It is in units of 3DGS's rate, not of the rate in use: noise explores, and where centres
+    /// It is in units of 3DGS's rate, not of the rate in use: noise explores, and where centers
     /// take larger steps, as large noise leaves them beside what they show.
     pub(super) fn noise_at(&self, step: u32, extent: f32) -> f32 {
         match self.density {

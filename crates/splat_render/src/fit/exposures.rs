@@ -1,12 +1,12 @@
-//! Exposure and white balance of photos under optimisation: a gain and an offset per channel and
+//! Exposure and white balance of photos under optimization: a gain and an offset per channel and
 //! photo, fitted with the splats.
 //!
 //! Brighter splats and darker gains look the same, and so do offsets of one sign: after each round
 //! the gains' logarithms and the offsets are brought back to a mean of zero, channel by channel. The
-//! splats have the colours of the mean photo.
+//! splats have the colors of the mean photo.
 //!
 //! Gain and offset of a photo do nearly the same: both make it brighter. Adam works on what sets them
-//! apart: contrast about the photo's mean colour, and that colour itself.
+//! apart: contrast about the photo's mean color, and that color itself.
 
 use rayon::prelude::*;
 
@@ -20,7 +20,7 @@ const ADAM: (f64, f64, f64) = (0.9, 0.99, 1e-15);
 /// What Adam's rate decays to until the end of the fit, as a part of the start's.
 const DECAY: f64 = 0.03;
 /// The rates at the start add up to this over the rounds of a fit, in logarithms of gain and units of
-/// colour: with the decay, exposures get a bit more than a quarter as far, three stops.
+/// color: with the decay, exposures get a bit more than a quarter as far, three stops.
 const REACH: f64 = 3.5;
 /// Least and most of the rate at the start.
 const RATES: (f64, f64) = (0.005, 0.05);
@@ -39,7 +39,7 @@ pub struct ExposureState {
     pub gains: Vec<[f64; 3]>,
     /// Added to R, G and B after it.
     pub offsets: Vec<[f64; 3]>,
-    /// Adam's first moments: contrast of R, G and B, then their mean colour.
+    /// Adam's first moments: contrast of R, G and B, then their mean color.
     pub first: Vec<[f64; 6]>,
     /// Adam's second moments.
     pub second: Vec<[f64; 6]>,
@@ -54,7 +54,7 @@ pub struct ExposureState {
 pub struct Exposures {
     /// Which photos have one of their own.
     is_fitted: Vec<bool>,
-    /// Mean colour of each photo where it counts, 0..1.
+    /// Mean color of each photo where it counts, 0..1.
     means: Vec<[f64; 3]>,
     /// Gains and offsets that each photo's are pulled to, and how much.
     start: Vec<[[f64; 3]; 2]>,
@@ -83,7 +83,7 @@ impl Exposures {
     }
 
     /// Sets where the exposures start: a gain above 0 and an offset for each photo, or None for one
-    /// that has the splats' own colours and keeps them. The starts' backgrounds do not count.
+    /// that has the splats' own colors and keeps them. The starts' backgrounds do not count.
     ///
     /// What is known of a photo is better than what its render says of it, as long as that is a poor
     /// one: against a render with errors, a gain seems lower than it is. So each start comes with a
@@ -234,7 +234,7 @@ impl Exposures {
     }
 
     /// Brings the means of log gain and of offset over the fitted photos back to zero, as if the
-    /// splats' colours took them up.
+    /// splats' colors took them up.
     fn anchor(&mut self) {
         let fitted: Vec<usize> = (0..self.is_fitted.len()).filter(|&k| self.is_fitted[k]).collect();
         if fitted.is_empty() {
@@ -245,7 +245,7 @@ impl Exposures {
         for c in 0..3 {
             let scale = (fitted.iter().map(|&k| gains[k][c].ln()).sum::<f64>() / n).exp();
             fitted.iter().for_each(|&k| gains[k][c] /= scale);
-            // Colours higher by `shift` in the splats are higher by gain times that in the photo.
+            // Colors higher by `shift` in the splats are higher by gain times that in the photo.
             let gain: f64 = fitted.iter().map(|&k| gains[k][c]).sum();
             let shift = fitted.iter().map(|&k| offsets[k][c]).sum::<f64>() / gain;
             fitted.iter().for_each(|&k| offsets[k][c] -= gains[k][c] * shift);
@@ -253,7 +253,7 @@ impl Exposures {
     }
 }
 
-/// Mean colour of the pixels that count, by how much they do.
+/// Mean color of the pixels that count, by how much they do.
 fn mean_color(target: &Target) -> [f64; 3] {
     let channels = target.channels as usize;
     let (mut sums, mut total) = ([0.0; 3], 0.0);
@@ -291,8 +291,8 @@ mod tests {
     }
 
     #[test]
-    fn exposures_of_photos_of_known_colours_are_found_up_to_their_mean() {
-        // A scene of two colours whose photos have these gains and offsets.
+    fn exposures_of_photos_of_known_colors_are_found_up_to_their_mean() {
+        // A scene of two colors whose photos have these gains and offsets.
         let scene = [0.2, 0.6];
         let truth = [(1.3, 0.002), (0.8, -0.004), (1.0 / (1.3 * 0.8), 0.002)];
         let targets = [photo(200), photo(120), photo(160)];

@@ -67,7 +67,7 @@ pub struct Fitter {
     step: u32,
 }
 
-/// 1.1 times the largest distance of a camera's centre from their mean (3DGS); 1 where all cameras
+/// 1.1 times the largest distance of a camera's center from their mean (3DGS); 1 where all cameras
 /// stand at one place.
 pub fn scene_extent(cameras: &[Camera]) -> f64 {
     let mean = cameras.iter().map(Camera::center).sum::<glam::DVec3>() / cameras.len() as f64;
@@ -248,7 +248,7 @@ impl Fitter {
     ///
     /// # Errors
     /// [`Error::Argument`] if cameras are not fitted, there is not a number for each, or cameras of
-    /// one number do not share a centre.
+    /// one number do not share a center.
     pub fn set_rigs(&mut self, numbers: &[u32]) -> Result<()> {
         let Some(cameras) = self.moving.as_mut() else {
             return Err(Error::argument("rigs", "are of cameras that are not fitted"));

@@ -14,7 +14,7 @@ pub use config::{Background, DensityControl, FitConfig};
 pub use exposures::{ExposureState, Exposures};
 pub use fitter::{Fitter, scene_extent};
 pub use initial::splats_from_points;
-pub use plane_sweep::{DepthMap, GreyPhoto, Sweep, plane_sweep};
+pub use plane_sweep::{DepthMap, GrayPhoto, Sweep, plane_sweep};
 
 pub use crate::constants::{ADAM, SSIM_C, SSIM_WINDOW};
 pub use crate::fit_device::{

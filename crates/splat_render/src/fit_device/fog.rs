@@ -41,7 +41,7 @@ pub(crate) fn sampled_every(splats: usize) -> usize {
 }
 
 impl FogCamera {
-    /// `sample` has the centres of every [`sampled_every`] splats.
+    /// `sample` has the centers of every [`sampled_every`] splats.
     pub fn new(camera: &Camera, sample: &[[f32; 3]]) -> Self {
         let row = |i: usize| camera.viewmat.row(i).to_array().map(|v| v as f32);
         let mut out = Self {
@@ -62,7 +62,7 @@ impl FogCamera {
         out
     }
 
-    /// Depth of a centre, if it lies before the camera, nearer than its nearest surface, and the picture
+    /// Depth of a center, if it lies before the camera, nearer than its nearest surface, and the picture
     /// shows it, widened by `radius`. As `is_fog` in mcmc_weigh.wgsl.
     fn depth(&self, [x, y, z]: [f32; 3], radius: f32) -> Option<f32> {
         let [u, v, depth] = self.rows.map(|[a, b, c, d]| ((a * x + b * y) + c * z) + d);

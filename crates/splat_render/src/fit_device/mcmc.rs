@@ -85,7 +85,7 @@ fn draw(run: &McmcRun, round: u32, k: u32, total: u32) -> u32 {
     ((u64::from(r) * u64::from(total)) >> 32) as u32
 }
 
-/// Whether all that is looked at is finite; colours only in the first round.
+/// Whether all that is looked at is finite; colors only in the first round.
 pub(super) fn finite(splats: &SplatArrays, i: usize, round: u32) -> bool {
     let stride = splats.stride();
     let colors = if round == 0 { &splats.sh[i * stride..(i + 1) * stride] } else { &[] };
@@ -136,7 +136,7 @@ pub(crate) fn mcmc(state: &mut FitState, run: &McmcRun) {
 }
 
 /// Overwrites `targets` with copies of splats that are drawn by weight, sharing opacity and size among
-/// all copies, and restarts the optimiser's moments of all of them.
+/// all copies, and restarts the optimizer's moments of all of them.
 fn spread(state: &mut FitState, run: &McmcRun, round: u32, weights: &[u32], targets: &[usize]) {
     let mut total = 0;
     let sums: Vec<u32> = weights

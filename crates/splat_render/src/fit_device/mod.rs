@@ -74,7 +74,7 @@ pub struct StepInput {
     pub opacity_regularizer: f32,
     /// Added to the loss: this times the mean scale (over splats and axes, world units).
     pub scale_regularizer: f32,
-    /// Size of the exploration noise on the centres (3DGS-MCMC, eq. 8), 0 for none. After Adam's
+    /// Size of the exploration noise on the centers (3DGS-MCMC, eq. 8), 0 for none. After Adam's
     /// update: mean += C (z * noise / (1 + exp(-100 (0.005 - opacity)))) with C the splat's 3D
     /// covariance, z from [`noise_normal`] and the parameters as updated.
     pub noise: f32,
@@ -141,7 +141,7 @@ impl StepInput {
         self.adam().validate()
     }
 
-    /// The optimiser's part of the step.
+    /// The optimizer's part of the step.
     pub fn adam(&self) -> AdamStep {
         AdamStep {
             number: self.step,
@@ -155,12 +155,12 @@ impl StepInput {
     }
 }
 
-/// A backend that keeps splats, optimiser state and photos where its kernels run.
+/// A backend that keeps splats, optimizer state and photos where its kernels run.
 ///
 /// The loss is `sum_p w_p ((1 - s) mean_c |x - y| + s (1 - mean_c SSIM)) / sum_p w_p` over pixels p
 /// and channels c, with s the SSIM weight, zero padding in the window, plus the loss of the depth,
-/// where the photo has one, and the two regularisers.
-/// Every parameter takes an Adam step in every step, seen or not; colours of splats that are not seen may
+/// where the photo has one, and the two regularizers.
+/// Every parameter takes an Adam step in every step, seen or not; colors of splats that are not seen may
 /// take theirs later, with the same bits (on GPUs whose driver fuses multiply-adds alike in both kernels). With [`Rates::ZERO`] nothing moves
 /// ([`AdamStep::is_frozen`]): no parameter, no moment, no noise; the loss, the density statistics and
 /// the cameras' gradients are as ever.
@@ -211,7 +211,7 @@ pub trait FitDevice: Send {
     /// Gradients of the exposures of all steps since the last call that had one, in order.
     fn exposure_gradients(&mut self) -> Result<Vec<ExposureGradient>>;
 
-    /// Loss of the last step (before its update, regularisers not included).
+    /// Loss of the last step (before its update, regularizers not included).
     fn loss(&mut self) -> Result<f32>;
 }
 

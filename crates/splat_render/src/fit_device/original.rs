@@ -1,5 +1,5 @@
 //! The original density control (3DGS, Kerbl et al. 2023): clone small and split large splats whose
-//! projected centre keeps being pulled, then prune faint ones. This is what devices that do it by
+//! projected center keeps being pulled, then prune faint ones. This is what devices that do it by
 //! themselves are held to, bit for bit: pulls are whole numbers, draws are hashes, sizes are compared by
 //! their logarithms.
 
@@ -16,7 +16,7 @@ use crate::splats::SplatArrays;
 pub(crate) const PULL_UNITS: f32 = 16_777_216.0;
 /// Longest sum of gradients that is told from longer ones.
 pub(crate) const PULL_SUM_MAX: f32 = 255.0;
-/// Mean gradient of the projected centre above which splats are added: 2e-4.
+/// Mean gradient of the projected center above which splats are added: 2e-4.
 pub(crate) const PULL_GROW: u32 = 3355;
 /// Splats larger than this part of the scene's extent are split, smaller ones cloned.
 const SCALE_SPLIT: f64 = 0.01;
@@ -53,7 +53,7 @@ impl OriginalRun {
     }
 }
 
-/// The mean gradient of a splat's projected centre, in [`PULL_UNITS`].
+/// The mean gradient of a splat's projected center, in [`PULL_UNITS`].
 fn pull(grad_sum: f32, seen: f32) -> u32 {
     if !(grad_sum.is_finite() && seen.is_finite()) {
         return 0;

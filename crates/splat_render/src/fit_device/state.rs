@@ -36,7 +36,7 @@ pub struct FitState {
 }
 
 impl FitState {
-    /// Fresh optimiser state around `splats`.
+    /// Fresh optimizer state around `splats`.
     pub fn new(splats: SplatArrays) -> Self {
         let (n, degree) = (splats.len(), splats.sh_degree);
         Self {

@@ -1,14 +1,14 @@
-//! Steps that colours wait for. A splat that a step's photo does not show has no gradient of its colours,
-//! so that what the optimiser does to them needs nothing but the step's rates: it is done when the splat
-//! is next seen, or when someone asks for all colours, by the same operations in the same order.
+//! Steps that colors wait for. A splat that a step's photo does not show has no gradient of its colors,
+//! so that what the optimizer does to them needs nothing but the step's rates: it is done when the splat
+//! is next seen, or when someone asks for all colors, by the same operations in the same order.
 
 use crate::stages::AdamStep;
 
-/// Steps that colours wait for, at most. Whoever waits longer is brought up to date with all others, so
+/// Steps that colors wait for, at most. Whoever waits longer is brought up to date with all others, so
 /// that no kernel goes through more than so many steps at once.
 pub const COLOR_WAIT: usize = 128;
 
-/// What a step does to all colours, gradients apart.
+/// What a step does to all colors, gradients apart.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct ColorStep {
     /// Rates of the first coefficient and of the others.
@@ -25,7 +25,7 @@ impl ColorStep {
     }
 }
 
-/// The steps since all colours were last up to date.
+/// The steps since all colors were last up to date.
 #[derive(Debug, Clone)]
 pub(crate) struct WaitingSteps {
     steps: Vec<ColorStep>,
@@ -46,7 +46,7 @@ impl WaitingSteps {
         Self { steps: Vec::new(), degree: 0, most: most.clamp(1, COLOR_WAIT) }
     }
 
-    /// Whether all colours must be brought up to date before `step`.
+    /// Whether all colors must be brought up to date before `step`.
     pub fn must_end_before(&self, step: &AdamStep) -> bool {
         let others = step.is_frozen() || step.sh_degree != self.degree;
         !self.steps.is_empty() && (others || self.steps.len() == self.most)
@@ -60,7 +60,7 @@ impl WaitingSteps {
         }
     }
 
-    /// All colours are up to date.
+    /// All colors are up to date.
     pub fn clear(&mut self) {
         self.steps.clear();
     }

@@ -1,5 +1,5 @@
-//! adam: one optimiser step of all parameters, the exploration noise, and what density control
-//! watches. In fits colours wait ([`super::waiting_colors`]).
+//! adam: one optimizer step of all parameters, the exploration noise, and what density control
+//! watches. In fits colors wait ([`super::waiting_colors`]).
 
 use std::ops::Range;
 
@@ -16,10 +16,10 @@ use crate::fit_device::DensityStats;
 use crate::splats::{SplatArrays, SplatParams};
 use crate::stages::{AdamState, AdamStep, SplatGradients};
 
-/// Floats of colour per workgroup.
+/// Floats of color per workgroup.
 const COLOR_FLOATS_PER_GROUP: u32 = 256;
 
-/// Splats under optimisation, on the device.
+/// Splats under optimization, on the device.
 #[derive(Debug)]
 pub(super) struct AdamBuffers {
     /// Parameters.
@@ -119,7 +119,7 @@ impl AdamBuffers {
         Ok((arrays, stats))
     }
 
-    /// project_backward, the step of all but colours, and the statistics.
+    /// project_backward, the step of all but colors, and the statistics.
     pub fn fit_ops(&self, gpu: &Gpu, input: &AdamInput<'_>, bins: &SplatBins) -> Vec<Op> {
         let Self { splats, first, second, notes, .. } = self;
         let (geometry, colors) = (GEOMETRY as u64, splats.color_floats);
@@ -143,7 +143,7 @@ impl AdamBuffers {
         splats.windows(gpu).into_iter().map(op).collect()
     }
 
-    /// The step of all but colours, from these gradients.
+    /// The step of all but colors, from these gradients.
     fn geometry_ops(&self, gpu: &Gpu, step: &wgpu::Buffer, gradient: &wgpu::Buffer) -> Vec<Op> {
         let Self { splats, first, second, .. } = self;
         let op = |window: Range<u32>| {
@@ -163,7 +163,7 @@ impl AdamBuffers {
         splats.windows(gpu).into_iter().map(op).collect()
     }
 
-    /// The step of colours, from these gradients.
+    /// The step of colors, from these gradients.
     fn color_ops(&self, gpu: &Gpu, [view, step, gradient]: [&wgpu::Buffer; 3]) -> Vec<Op> {
         let Self { splats, first, second, .. } = self;
         let floats = splats.color_floats;
@@ -186,7 +186,7 @@ impl AdamBuffers {
     }
 }
 
-/// What is noted of each splat where its colours are up to date.
+/// What is noted of each splat where its colors are up to date.
 fn note_rows(stats: &DensityStats) -> Vec<[f32; NOTES]> {
     let row = |(&pull, &seen)| {
         let mut row = [0.0; NOTES];

@@ -28,11 +28,11 @@ pub(super) struct Compared<'a> {
     pub view: &'a wgpu::Buffer,
     /// A [`DepthStep`].
     pub uniform: &'a wgpu::Buffer,
-    /// `[H * W]` colour and transmittance.
+    /// `[H * W]` color and transmittance.
     pub picture: &'a wgpu::Buffer,
     /// `[H * W]` accumulated depth.
     pub depths: &'a wgpu::Buffer,
-    /// `[H * W]` gradients of colour and, from here on, accumulated depth.
+    /// `[H * W]` gradients of color and, from here on, accumulated depth.
     pub v_picture: &'a wgpu::Buffer,
     /// `[H * W]` as rasterize_backward reads them.
     pub totals: &'a wgpu::Buffer,

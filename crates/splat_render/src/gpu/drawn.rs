@@ -105,14 +105,14 @@ impl Scans {
 pub(super) struct Drawn {
     /// `[N after * GEOMETRY]`
     pub geometry: wgpu::Buffer,
-    /// `[N after]` twice the row of a splat's colours and moments, and 1 where its moments are zero.
+    /// `[N after]` twice the row of a splat's colors and moments, and 1 where its moments are zero.
     pub rows: wgpu::Buffer,
     /// Splats after the run.
     pub splats: u32,
     pub cells: Cells,
 }
 
-/// The box of the first so many splats' centres, in parts.
+/// The box of the first so many splats' centers, in parts.
 #[derive(Debug)]
 pub(super) struct Bounds {
     pub corners: wgpu::Buffer,

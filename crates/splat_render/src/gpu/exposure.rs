@@ -1,4 +1,4 @@
-//! exposure and exposure_backward: a picture's colours as a photo of some gain and offset has them.
+//! exposure and exposure_backward: a picture's colors as a photo of some gain and offset has them.
 
 use super::device::{Gpu, Op};
 use super::kernels::Kernel;
@@ -12,7 +12,7 @@ const SUMS: usize = 6;
 /// What the kernels write, for pictures of one size.
 #[derive(Debug)]
 pub(super) struct ExposureBuffers {
-    /// `[H * W]` corrected colour and transmittance.
+    /// `[H * W]` corrected color and transmittance.
     pub corrected: wgpu::Buffer,
     /// `[EXPOSURE_GROUPS * SUMS]`
     pub sums: wgpu::Buffer,
@@ -25,9 +25,9 @@ pub(super) struct Exposed<'a> {
     pub view: &'a wgpu::Buffer,
     /// An [`ExposureUniform`].
     pub uniform: &'a wgpu::Buffer,
-    /// `[H * W]` colour and transmittance.
+    /// `[H * W]` color and transmittance.
     pub picture: &'a wgpu::Buffer,
-    /// `[H * W]` gradients of the corrected colours, then of the picture's.
+    /// `[H * W]` gradients of the corrected colors, then of the picture's.
     pub v_picture: &'a wgpu::Buffer,
     /// `[H * W]` as rasterize_backward reads them.
     pub totals: &'a wgpu::Buffer,
@@ -63,7 +63,7 @@ impl ExposureBuffers {
         self.op(gpu, Kernel::Exposure, of)
     }
 
-    /// Turns gradients of the corrected colours into those of the picture, and adds up the others.
+    /// Turns gradients of the corrected colors into those of the picture, and adds up the others.
     pub fn backward(&self, gpu: &Gpu, of: Exposed<'_>) -> Op {
         self.op(gpu, Kernel::ExposureBackward, of)
     }

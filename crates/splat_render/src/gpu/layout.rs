@@ -15,7 +15,7 @@ use crate::target::Weight;
 pub(super) const GEOMETRY: usize = 11;
 
 /// Floats per splat or slot in a buffer of 2D gradients: mean 2 (moments of order 1 in a slot),
-/// factor 3 (order 2), depth, colour 3, opacity.
+/// factor 3 (order 2), depth, color 3, opacity.
 pub(super) const GRADIENT: usize = 10;
 
 /// The same with the absolute gradient of the mean, 2 floats, behind it.
@@ -26,8 +26,8 @@ pub(super) const CAMERA: usize = 16;
 
 /// Words per splat of what a fit notes beside parameters and moments, and where in them lie: the sum of
 /// gradient lengths and the steps seen, as floats, which density control watches; twice the first of the
-/// steps that its colours wait for, and 1 more where that one has a gradient; and that gradient, as
-/// floats, of the colour 3 and the direction it was seen along 3.
+/// steps that its colors wait for, and 1 more where that one has a gradient; and that gradient, as
+/// floats, of the color 3 and the direction it was seen along 3.
 pub(super) const NOTES: usize = 9;
 pub(super) const NOTE_PULL: usize = 0;
 pub(super) const NOTE_SEEN: usize = 1;
@@ -45,7 +45,7 @@ pub(super) const EXPOSURE_GROUPS: u32 = 64;
 /// Workgroups of the depth loss, each with a sum of its own.
 pub(super) const DEPTH_GROUPS: u32 = 64;
 
-/// Camera, background and how colours and parameters are stored.
+/// Camera, background and how colors and parameters are stored.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub(super) struct View {
@@ -239,7 +239,7 @@ impl From<&Exposure<f32>> for ExposureUniform {
     }
 }
 
-/// The steps that colours may wait for.
+/// The steps that colors may wait for.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub(super) struct ColorSteps {

@@ -29,9 +29,9 @@ pub(super) struct LossBuffers {
     pub weights: wgpu::Buffer,
     /// `[9 * H * W]` slopes of SSIM; `[H * W * 12]` what goes from pass to pass where they go along lines.
     slopes: wgpu::Buffer,
-    /// `[H * W]` gradients of colour and, 0, accumulated depth.
+    /// `[H * W]` gradients of color and, 0, accumulated depth.
     pub v_picture: wgpu::Buffer,
-    /// `[H * W]` colour . v_color.
+    /// `[H * W]` color . v_color.
     pub totals: wgpu::Buffer,
     /// `[parts * 2]` weighted sums of SSIM and of |x - y|.
     pub sums: wgpu::Buffer,

@@ -1,6 +1,6 @@
 //! MCMC's density control on the device, with the bits of `fit_device::mcmc`: dead splats move to living
 //! ones, fresh ones are added, and all are put in the order of Morton's curve. The host learns the
-//! centres of a sample, what the weights add up to, and the bounding box.
+//! centers of a sample, what the weights add up to, and the bounding box.
 
 use bytemuck::{Pod, Zeroable};
 use rayon::prelude::*;
@@ -68,9 +68,9 @@ pub(super) fn draw(
     };
     let samples = n.div_ceil(every);
     let sample = words("sample", 3 * samples)?;
-    // Bound and not read where only centres are asked for.
+    // Bound and not read where only centers are asked for.
     let none = gpu.buffer("cameras", size_of::<FogCamera>() as u64)?;
-    let centres: Vec<[f32; 3]> = if run.cameras.is_empty() {
+    let centers: Vec<[f32; 3]> = if run.cameras.is_empty() {
         gpu.submit(&[&[copy]])?;
         Vec::new()
     } else {
@@ -80,7 +80,7 @@ pub(super) fn draw(
         bytemuck::pod_collect_to_vec(&data[0])
     };
     let fog: Vec<FogCamera> =
-        run.cameras.par_iter().map(|camera| FogCamera::new(camera, &centres)).collect();
+        run.cameras.par_iter().map(|camera| FogCamera::new(camera, &centers)).collect();
     let cameras = if fog.is_empty() { none } else { gpu.upload("cameras", &fog)? };
 
     let copies = words("copies", n + fresh)?;

@@ -14,7 +14,7 @@ use crate::stages::{Colors, ProjectOptions, Projected, SplatParams};
 pub(super) struct SplatBuffers {
     /// Number of splats.
     pub splats: u32,
-    /// Floats of colour per splat.
+    /// Floats of color per splat.
     pub color_floats: u64,
     /// `[N * GEOMETRY]`
     pub geometry: wgpu::Buffer,

@@ -83,7 +83,7 @@ impl Binned {
 /// A picture on the device.
 #[derive(Debug)]
 pub(super) struct PictureBuffers {
-    /// `[H * W]` colour and final transmittance.
+    /// `[H * W]` color and final transmittance.
     pub picture: wgpu::Buffer,
     /// `[H * W]` accumulated depths.
     pub depths: wgpu::Buffer,

@@ -38,7 +38,7 @@ impl ResidentPicture {
         })
     }
 
-    /// `[H * W]` colour without background, and final transmittance, row-major.
+    /// `[H * W]` color without background, and final transmittance, row-major.
     pub fn picture(&self) -> &wgpu::Buffer {
         &self.buffers.picture
     }

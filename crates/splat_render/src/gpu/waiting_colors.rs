@@ -1,4 +1,4 @@
-//! Colours that wait (`fit_device::waiting`): a fit's project brings those of splats that it sees up to
+//! Colors that wait (`fit_device::waiting`): a fit's project brings those of splats that it sees up to
 //! date before it evaluates them, and another kernel those of all.
 
 use std::ops::Range;
@@ -11,7 +11,7 @@ use super::layout::{GEOMETRY, NOTES, SPLATS_PER_GROUP};
 use super::project::{Projection, SPLAT_2D, rows, window_uniform};
 
 impl AdamBuffers {
-    /// Projects all splats, those that are seen with colours that are up to date; `steps` is a
+    /// Projects all splats, those that are seen with colors that are up to date; `steps` is a
     /// [`ColorSteps`](super::layout::ColorSteps).
     pub fn project_ops(
         &self,
@@ -23,7 +23,7 @@ impl AdamBuffers {
         self.color_kernel(gpu, Kernel::FitProject, to, bins, steps)
     }
 
-    /// Brings all colours up to date. The SH degree in use is that of the view.
+    /// Brings all colors up to date. The SH degree in use is that of the view.
     pub fn catch_up_ops(
         &self,
         gpu: &Gpu,

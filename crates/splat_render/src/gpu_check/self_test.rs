@@ -252,7 +252,7 @@ fn a_fit(device: &mut dyn FitDevice) -> Result<Outputs> {
     device.step(&input)?;
     let step = device.download()?;
     let camera = device.camera_gradients()?;
-    // Colours take the first step's update in the second's project. Nothing moves so far that a decision
+    // Colors take the first step's update in the second's project. Nothing moves so far that a decision
     // could differ; the moments tell.
     device.upload(begin)?;
     let colors = StepInput { rates: Rates { sh0: 1e-5, sh_rest: 1e-5, ..Rates::ZERO }, ..input };

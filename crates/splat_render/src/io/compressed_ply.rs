@@ -1,6 +1,6 @@
 //! PlayCanvas's compressed `.ply`: 16 bytes a splat, packed against the bounds of its chunk of 256.
 //!
-//! Element `chunk`: bounds of positions, log-scales and colours, floats. Element `vertex`: four
+//! Element `chunk`: bounds of positions, log-scales and colors, floats. Element `vertex`: four
 //! packed u32. Element `sh`, if any: one byte for each coefficient, all red, green, then blue.
 
 use std::io::{BufRead, Read};
@@ -90,7 +90,7 @@ pub fn read(
     }
     let position = columns(chunk, &BOUNDS[0], Kind::Float, named)?;
     let scale = columns(chunk, &BOUNDS[1], Kind::Float, named)?;
-    // Older files have no bounds of colours: those are then in [0, 1].
+    // Older files have no bounds of colors: those are then in [0, 1].
     let color = match chunk.offset(BOUNDS[2][0], Kind::Float) {
         Some(_) => Some(columns(chunk, &BOUNDS[2], Kind::Float, named)?),
         None => None,

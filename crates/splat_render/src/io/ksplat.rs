@@ -1,6 +1,6 @@
 //! mkkellogg's `.ksplat`, versions 0.1 and later: a header, headers of sections, sections.
 //!
-//! Level 0 holds floats; levels 1 and 2 hold positions as u16 about the centre of a bucket and the
+//! Level 0 holds floats; levels 1 and 2 hold positions as u16 about the center of a bucket and the
 //! rest as half floats, level 2 its SH as bytes. SH is per degree: all red, all green, all blue.
 
 use half::f16;
@@ -20,7 +20,7 @@ const SECTION_HEADER: usize = 1024;
 const SH_DEGREE: u32 = 2;
 /// Half the range of level 2's SH bytes where the header gives none.
 const SH_HALF_RANGE: f32 = 1.5;
-/// Steps from a bucket's centre to its side where the section gives none.
+/// Steps from a bucket's center to its side where the section gives none.
 const POSITION_STEPS: u32 = 32767;
 
 /// Where the parts of a splat are at one compression level.
@@ -49,7 +49,7 @@ struct Section<'a> {
     bucket_size: usize,
     full_buckets: usize,
     partial_sizes: &'a [u8],
-    /// Bytes per bucket, of which the first 12 are its centre.
+    /// Bytes per bucket, of which the first 12 are its center.
     bucket_stride: usize,
     buckets: &'a [u8],
     /// World units per step of a position.
@@ -151,7 +151,7 @@ impl<'a> Section<'a> {
         u32_at(self.partial_sizes, 4 * bucket) as usize
     }
 
-    /// Whether every splat has a bucket with a centre.
+    /// Whether every splat has a bucket with a center.
     fn buckets_cover(&self, bucket_count: usize) -> bool {
         let partial = self.partial_sizes.len() / 4;
         let full = self.bucket_size.saturating_mul(self.full_buckets);
@@ -192,9 +192,9 @@ impl<'a> Section<'a> {
                     }
                     bucket - 1
                 };
-                let centre = &self.buckets[home * self.bucket_stride..][..12];
+                let center = &self.buckets[home * self.bucket_stride..][..12];
                 std::array::from_fn(|k| {
-                    (f32::from(u16_at(row, 2 * k)) - self.steps) * self.step + f32_at(centre, 4 * k)
+                    (f32::from(u16_at(row, 2 * k)) - self.steps) * self.step + f32_at(center, 4 * k)
                 })
             };
             splats.scales[to] = std::array::from_fn(|k| log_scale(number(row, level.scale, k)));

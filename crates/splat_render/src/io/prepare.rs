@@ -40,7 +40,7 @@ pub fn prepare<'a>(
     if splats.sh_degree > room.sh_degree {
         notes.push(if room.sh_degree == 0 {
             format!(
-                "A {} holds no view-dependent colour: the spherical harmonics of degree 1 to {} \
+                "A {} holds no view-dependent color: the spherical harmonics of degree 1 to {} \
                  are dropped.",
                 room.name, splats.sh_degree
             )

@@ -35,12 +35,12 @@ pub fn unit_byte(value: f64) -> u8 {
     (value * 255.0).round() as u8
 }
 
-/// 0.5 + C0 dc: the colour of a splat without view dependence.
+/// 0.5 + C0 dc: the color of a splat without view dependence.
 pub fn color_of_dc(dc: f32) -> f64 {
     0.5 + C0 * f64::from(dc)
 }
 
-/// The DC coefficient of a colour.
+/// The DC coefficient of a color.
 pub fn dc_of_color(color: f64) -> f32 {
     ((color - 0.5) / C0) as f32
 }

@@ -1,6 +1,6 @@
 //! antimatter15's `.splat`: 32 bytes a splat and no header.
 //!
-//! Position and scale as floats, colour and opacity as bytes, rotation wxyz as bytes.
+//! Position and scale as floats, color and opacity as bytes, rotation wxyz as bytes.
 
 use super::bytes::{Named, f32_at};
 use super::prepare::{Room, prepare, say_clipped, unfit};
@@ -69,6 +69,6 @@ pub fn encode(file: &SplatFile, notes: &mut Vec<String>) -> Result<Vec<u8>> {
         // `as` saturates: 1 becomes 255.
         out.extend(quat.map(|c| (c / norm * 128.0 + 128.0).round() as u8));
     }
-    say_clipped(notes, clipped, "colour", "0 to 1");
+    say_clipped(notes, clipped, "color", "0 to 1");
     Ok(out)
 }

@@ -36,7 +36,7 @@ const EXTENSIONS_MAX: u64 = 1 << 20;
 const WINDOW_MAX: u64 = 8 << 20;
 /// Most bits after the point: positions have 24 in all.
 const FRACTION_BITS_MAX: u8 = 24;
-/// A colour byte is (0.5 + 0.15 dc) 255.
+/// A color byte is (0.5 + 0.15 dc) 255.
 const COLOR_SCALE: f64 = 0.15;
 /// A scale byte is (log-scale + 10) 16.
 const SCALE_OFFSET: f64 = 10.0;
@@ -83,7 +83,7 @@ impl Header {
         Ok(Self { version, count, degree, fraction_bits, flags: header[14] })
     }
 
-    /// Bytes of each array: positions, opacities, colours, scales, rotations, SH.
+    /// Bytes of each array: positions, opacities, colors, scales, rotations, SH.
     fn sizes(&self) -> [usize; 6] {
         let rotation = if self.version == 2 { 3 } else { 4 };
         [9, 1, 3, 3, rotation, 3 * (sh::coeffs(self.degree) - 1)].map(|each| each * self.count)
@@ -295,7 +295,7 @@ pub fn encode(file: &SplatFile, notes: &mut Vec<String>) -> Result<Vec<u8>> {
         clipped += usize::from(!(0.0..=1.0).contains(&value));
         data.push(unit_byte(value));
     }
-    say_clipped(notes, clipped, "colour coefficient", "-3.3 to 3.3");
+    say_clipped(notes, clipped, "color coefficient", "-3.3 to 3.3");
     clipped = 0;
     for scale in splats.scales.as_flattened() {
         let value = ((f64::from(*scale) + SCALE_OFFSET) * SCALE_STEPS).round();

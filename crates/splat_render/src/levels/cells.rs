@@ -12,7 +12,7 @@ pub enum Node {
 pub struct Cells {
     /// All nodes.
     pub nodes: Vec<Node>,
-    /// Number of cells, which are numbered along the tree: neighbours have near numbers.
+    /// Number of cells, which are numbered along the tree: neighbors have near numbers.
     pub count: usize,
 }
 

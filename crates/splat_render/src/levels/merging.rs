@@ -1,4 +1,4 @@
-//! Fewer splats that look alike from afar: neighbours along Morton's curve are merged, those first whose
+//! Fewer splats that look alike from afar: neighbors along Morton's curve are merged, those first whose
 //! merging moves the least color.
 //!
 //! The mean, spread and color of a merged splat are those of what it stands for, each weighted by its
@@ -59,7 +59,7 @@ impl Ord for Cost {
     }
 }
 
-/// Two neighbours, and their versions when their merging had that cost.
+/// Two neighbors, and their versions when their merging had that cost.
 type Pair = (Reverse<(Cost, u32)>, u32, [u32; 2]);
 
 /// Levels of the splats, which lie in Morton's order and are finite, one for each of the falling counts.

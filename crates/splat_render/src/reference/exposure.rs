@@ -1,8 +1,8 @@
-//! exposure and exposure_backward: a picture's colours as a photo of some gain and offset has them.
+//! exposure and exposure_backward: a picture's colors as a photo of some gain and offset has them.
 
 use crate::stages::{Exposure, ExposureGradients, Image};
 
-/// A pixel's colour before it is cut to what a photo holds.
+/// A pixel's color before it is cut to what a photo holds.
 fn raw(exposure: &Exposure<f64>, color: [f64; 3], t: f64) -> [f64; 3] {
     let Exposure { gain, offset, background } = *exposure;
     std::array::from_fn(|c| match background {

@@ -9,7 +9,7 @@ use crate::camera::Camera;
 use crate::constants::TRANSMITTANCE_MIN;
 use crate::stages::{Colors, ProjectOptions, Projected, SplatParams};
 
-/// Hash of every decision: culling, Jacobian limits, colour's cut at zero, depth order, pairs that
+/// Hash of every decision: culling, Jacobian limits, color's cut at zero, depth order, pairs that
 /// contribute, alphas that are capped, where each pixel stops.
 pub fn decisions(
     splats: &SplatParams<'_, f64>,

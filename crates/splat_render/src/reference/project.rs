@@ -9,13 +9,13 @@ use crate::stages::{Colors, ProjectOptions, Projected, SplatParams};
 
 /// What both directions of the stage need of one splat.
 pub(super) struct Geometry {
-    /// Camera-space centre.
+    /// Camera-space center.
     pub t: DVec3,
     /// Splat axes in the world.
     pub axes: DMat3,
     /// Norm of the quaternion as given.
     pub quat_norm: f64,
-    /// Normalised quaternion (w, x, y, z).
+    /// Normalized quaternion (w, x, y, z).
     pub quat: [f64; 4],
     /// Standard deviations along the axes.
     pub scales: DVec3,
@@ -90,15 +90,15 @@ pub(super) fn geometry(
     Some(Geometry { t, axes, quat_norm, quat, scales, xz, yz, inside, a, m, factor, compensation })
 }
 
-/// Unit view direction in the world and the length it was normalised by.
+/// Unit view direction in the world and the length it was normalized by.
 pub(super) fn direction(camera: &Camera, t: DVec3) -> (DVec3, f64) {
-    // R^T t is the vector from the camera's centre to the mean, without the cancellation of
+    // R^T t is the vector from the camera's center to the mean, without the cancellation of
     // subtracting two far-away points.
     let along = camera.rotation().transpose() * t;
     (along / along.length(), along.length())
 }
 
-/// SH colour before the cut at zero.
+/// SH color before the cut at zero.
 pub(super) fn sh_color(degree: u32, coeffs: &[[f64; 3]], dir: DVec3) -> DVec3 {
     let basis = sh::basis(degree, dir.to_array());
     (0..sh::coeffs(degree)).map(|k| basis[k] * DVec3::from(coeffs[k])).sum::<DVec3>() + 0.5
@@ -124,7 +124,7 @@ pub(super) fn project(
             camera.fy * g.t.y / g.t.z + camera.cy,
         );
         let size = DVec2::new(f64::from(camera.width), f64::from(camera.height));
-        // No pixel centre can be reached.
+        // No pixel center can be reached.
         if (center + radii).cmplt(DVec2::ZERO).any() || (center - radii).cmpgt(size).any() {
             continue;
         }

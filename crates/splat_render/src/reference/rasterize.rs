@@ -12,7 +12,7 @@ pub(super) fn order(projected: &Projected<f64>) -> Vec<usize> {
 
 /// One splat's meeting with one pixel.
 pub(super) struct Pair {
-    /// Offset of the pixel's centre from the splat's.
+    /// Offset of the pixel's center from the splat's.
     pub dx: f64,
     pub dy: f64,
     /// The same, whitened.
@@ -85,7 +85,7 @@ pub(super) fn rasterize(projected: &Projected<f64>, background: [f64; 3]) -> Ima
 
 /// Pixels at which an f32 implementation may rightly differ from this one: a pair there lies within
 /// `alpha_band` (relative) of the alpha threshold, or the transmittance within 1e-4 of its own, or
-/// two neighbours' depths within 1e-6 of each other.
+/// two neighbors' depths within 1e-6 of each other.
 pub fn band_pixels(projected: &Projected<f64>, alpha_band: f64) -> Vec<bool> {
     let (w, h) = (projected.width, projected.height);
     let ids = order(projected);

@@ -4,16 +4,16 @@ use num_traits::Float;
 
 use crate::error::{Error, Result};
 
-/// Gain and offset per channel of one photo. In a photo without alpha a picture's colours become
+/// Gain and offset per channel of one photo. In a photo without alpha a picture's colors become
 /// `gain * color + offset`. In one with alpha the camera saw what is before the background alone:
-/// with T the picture's transmittance and b its background, colours become
+/// with T the picture's transmittance and b its background, colors become
 /// `gain * (color - T b) + offset * (1 - T) + T b`.
 ///
-/// What comes out is cut to 0..=1, which is all that a photo holds: where a photo is white, a colour
-/// may be any that is white in it. Back goes what brings a colour that was cut closer to what a photo
+/// What comes out is cut to 0..=1, which is all that a photo holds: where a photo is white, a color
+/// may be any that is white in it. Back goes what brings a color that was cut closer to what a photo
 /// holds, and nothing that takes it further away.
 ///
-/// Colours are encoded as photos are (sRGB), 1 at the brightest: one stop is a gain of about
+/// Colors are encoded as photos are (sRGB), 1 at the brightest: one stop is a gain of about
 /// 2^(1/2.2).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Exposure<T> {
@@ -31,14 +31,14 @@ impl<T: Float> Exposure<T> {
         Self { gain: [T::one(); 3], offset: [T::zero(); 3], background: None }
     }
 
-    /// How a colour grows with the transmittance: b - gain b - offset, 0 where there is no
+    /// How a color grows with the transmittance: b - gain b - offset, 0 where there is no
     /// background to keep.
     pub(crate) fn behind(&self) -> [T; 3] {
         let Some(background) = self.background else { return [T::zero(); 3] };
         std::array::from_fn(|c| background[c] - self.gain[c] * background[c] - self.offset[c])
     }
 
-    /// What of a corrected colour's gradient `v` goes back, where the colour was `raw` before the cut.
+    /// What of a corrected color's gradient `v` goes back, where the color was `raw` before the cut.
     #[inline(always)]
     pub(crate) fn passed(raw: T, v: T) -> T {
         let leaves = (raw > T::one() && v < T::zero()) || (raw < T::zero() && v > T::zero());
@@ -65,7 +65,7 @@ impl<T: Float> Exposure<T> {
 /// Gradients of a loss of the corrected picture.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ExposureGradients<T> {
-    /// `[H * W]` with respect to the picture's colours.
+    /// `[H * W]` with respect to the picture's colors.
     pub v_color: Vec<[T; 3]>,
     /// `[H * W]` with respect to the picture's alpha; zeros in a photo without alpha.
     pub v_alpha: Vec<T>,

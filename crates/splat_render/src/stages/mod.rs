@@ -94,14 +94,14 @@ pub struct Projected<T> {
     pub width: u32,
     /// Image height in pixels.
     pub height: u32,
-    /// Centres in pixels.
+    /// Centers in pixels.
     pub means2d: Vec<[T; 2]>,
     /// Upper-triangular factor (p, q, r) of the conic: u = p dx + q dy, v = r dy,
-    /// sigma = (u^2 + v^2) / 2, with (dx, dy) = pixel centre - mean2d.
+    /// sigma = (u^2 + v^2) / 2, with (dx, dy) = pixel center - mean2d.
     pub factors: Vec<[T; 3]>,
     /// Camera-space z.
     pub depths: Vec<T>,
-    /// Colours.
+    /// Colors.
     pub colors: Vec<[T; 3]>,
     /// Opacities in 0..1, lowered where the project stage was told to (antialiased).
     pub opacities: Vec<T>,
@@ -235,7 +235,7 @@ pub struct ProjectedGradients<T> {
     pub v_colors: Vec<[T; 3]>,
     /// `[N]`
     pub v_opacities: Vec<T>,
-    /// Gradient of the background colour.
+    /// Gradient of the background color.
     pub v_background: [T; 3],
     /// `[N]` sums over pixels of the absolute value of each pixel's part of `v_means2d`, where
     /// asked for (AbsGS, Ye et al. 2024; gsplat's `absgrad`); project_backward does not read it.
@@ -278,13 +278,13 @@ impl<T: Copy + Default> ProjectedGradients<T> {
 pub struct SplatGradients<T> {
     /// `[N]`
     pub v_means: Vec<[T; 3]>,
-    /// `[N]` of the quaternions as given (before normalisation).
+    /// `[N]` of the quaternions as given (before normalization).
     pub v_quats: Vec<[T; 4]>,
     /// `[N]` of the scales as given (logs if raw).
     pub v_scales: Vec<[T; 3]>,
     /// `[N]` of the opacities as given (logits if raw).
     pub v_opacities: Vec<T>,
-    /// Laid out as the colours were given: `[N * stride]` or `[N]`.
+    /// Laid out as the colors were given: `[N * stride]` or `[N]`.
     pub v_colors: Vec<[T; 3]>,
     /// Rows of the gradient of the viewmat's upper 3x4 block.
     pub v_viewmat: [[f64; 4]; 3],
@@ -297,14 +297,14 @@ pub struct SplatGradients<T> {
 pub struct Loss<T> {
     /// The loss; 0 where the photo is masked out everywhere.
     pub value: T,
-    /// `[H * W]` its gradient with respect to the picture's colours.
+    /// `[H * W]` its gradient with respect to the picture's colors.
     pub v_color: Vec<[T; 3]>,
 }
 
 /// Adam's step sizes per kind of parameter.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Rates {
-    /// Centres, world units.
+    /// Centers, world units.
     pub means: f32,
     /// Quaternions.
     pub quats: f32,
@@ -324,7 +324,7 @@ impl Rates {
         Self { means: 0.0, quats: 0.0, scales: 0.0, opacities: 0.0, sh0: 0.0, sh_rest: 0.0 };
 }
 
-/// What one step of the optimiser is to do.
+/// What one step of the optimizer is to do.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AdamStep {
     /// Number of the step, from 1, for the bias correction.
@@ -337,7 +337,7 @@ pub struct AdamStep {
     pub opacity_regularizer: f32,
     /// Added to the loss: this times the mean scale (over splats and axes, world units).
     pub scale_regularizer: f32,
-    /// Size of the exploration noise on the centres (3DGS-MCMC, eq. 8), 0 for none. After Adam's
+    /// Size of the exploration noise on the centers (3DGS-MCMC, eq. 8), 0 for none. After Adam's
     /// update: mean += C (z * noise / (1 + exp(-100 (0.005 - opacity)))) with C the splat's 3D
     /// covariance, z from [`crate::fit::noise_normal`] and the parameters as updated.
     pub noise: f32,
@@ -384,7 +384,7 @@ impl AdamStep {
     }
 }
 
-/// Splats under optimisation: parameters and Adam's two moments, which have the same layout.
+/// Splats under optimization: parameters and Adam's two moments, which have the same layout.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct AdamState<T> {
     /// Parameters.

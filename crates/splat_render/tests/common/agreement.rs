@@ -6,7 +6,7 @@ use splat_render::fit::{DensityStats, FitDevice, FitState, Rates, StepInput, Tar
 use splat_render::stages::{AdamStep, ImageGradients, Projected};
 use splat_render::{Error, ProjectOptions, Stages};
 
-use super::optimisation::{full_step, random_adam, random_picture, random_target};
+use super::optimization::{full_step, random_adam, random_picture, random_target};
 use super::*;
 
 /// A 2D splat at or behind the camera's plane is not drawn and has no gradient.
@@ -178,7 +178,7 @@ pub fn frozen_steps_keep_the_moments(device: &mut dyn FitDevice) {
 /// where all move, and so do loss and camera.
 pub fn the_last_splats_stay(device: &mut dyn FitDevice) {
     let (before, input) = fitted(device);
-    // The regularisers are means over the splats that move.
+    // The regularizers are means over the splats that move.
     let input = StepInput { opacity_regularizer: 0.0, scale_regularizer: 0.0, ..input };
     device.step(&input).unwrap();
     let all = device.download().unwrap();

@@ -129,7 +129,7 @@ pub fn a_zero_quaternion_culls_its_splat(stages: &dyn Stages<f32>) {
 
 /// What lies just on either side of each threshold is drawn, or is not, alike everywhere.
 pub fn thresholds_are_the_same_everywhere(stages: &dyn Stages<f32>) {
-    // One pixel, splats centred on it: alpha is the opacity itself.
+    // One pixel, splats centerd on it: alpha is the opacity itself.
     let render = |opacities: &[f32]| {
         let mut projected = Projected::<f32>::culled(opacities.len(), 1, 1);
         for (i, &opacity) in opacities.iter().enumerate() {
@@ -171,8 +171,8 @@ pub fn tile_edges_show_nothing(stages: &dyn Stages<f32>, bounds: Bounds) {
     let mut rng = rng(23);
     let mut edges = Projected::<f32>::culled(81, 50, 50);
     for i in 0..81 {
-        // Centres on pixel centres and borders around the corner of four tiles, and reaches that end
-        // close to the tiles' last and first pixel centres.
+        // Centers on pixel centers and borders around the corner of four tiles, and reaches that end
+        // close to the tiles' last and first pixel centers.
         let at = |k: usize| [15.0f32, 15.5, 15.999, 16.0, 16.001, 16.5, 32.0, 49.5, 50.0][k];
         let deviation = 0.3 + 0.11 * f64::from(i as u32 % 7);
         let angle = f64::from(i as u32) * 0.3;
@@ -198,7 +198,7 @@ fn hard_splats_2d() -> Vec<(&'static str, Projected<f32>)> {
         mean[0] -= 150.0;
     }
     place(&mut outside, 0, [60.0, 45.0], [500.0, 400.0], 0.3, 0.9);
-    cases.push(("centres far outside, and one over all tiles", outside));
+    cases.push(("centers far outside, and one over all tiles", outside));
     let mut opaque = random_projected(&mut rng, 1000, 20, 20, 8.0);
     for i in 0..1000 {
         place(&mut opaque, i, [10.0, 10.0], [9.0, 7.0], 0.5, 1.0);

@@ -5,7 +5,7 @@ pub mod agreement;
 pub mod conformance;
 pub mod hard_cases;
 pub mod narrowed;
-pub mod optimisation;
+pub mod optimization;
 pub mod properties;
 pub mod waiting;
 
@@ -37,7 +37,7 @@ pub struct Scene<T> {
     pub quats: Vec<[T; 4]>,
     pub scales: Vec<[T; 3]>,
     pub opacities: Vec<T>,
-    /// `[N * sh_stride]`, or `[N]` where `sh_stride` is 0 (direct colours).
+    /// `[N * sh_stride]`, or `[N]` where `sh_stride` is 0 (direct colors).
     pub colors: Vec<[T; 3]>,
     pub sh_degree: u32,
     pub sh_stride: usize,
@@ -191,7 +191,7 @@ pub fn widen_adam_state(state: &AdamState<f32>) -> AdamState<f64> {
 }
 
 /// A camera 4 units from the world's origin, looking at it from a random side, with its principal
-/// point off the centre.
+/// point off the center.
 pub fn random_camera(rng: &mut Pcg64, width: u32, height: u32) -> Camera {
     let axis = DVec3::new(normal(rng), normal(rng), normal(rng)).normalize();
     let rotation =
@@ -213,7 +213,7 @@ pub fn random_camera(rng: &mut Pcg64, width: u32, height: u32) -> Camera {
 }
 
 /// N splats around the world's origin, most of them in view of [`random_camera`]. `sh_degree`
-/// None gives direct colours. Parameters are raw (log-scales, opacity logits).
+/// None gives direct colors. Parameters are raw (log-scales, opacity logits).
 pub fn random_scene(rng: &mut Pcg64, n: usize, sh_degree: Option<u32>) -> Scene<f32> {
     let mut scene = Scene::<f32> { raw: true, ..Scene::default() };
     if let Some(degree) = sh_degree {
@@ -291,7 +291,7 @@ pub fn place(
     }
 }
 
-/// Random gradients of a picture: N(0, 1) colours, smaller alpha and depth parts.
+/// Random gradients of a picture: N(0, 1) colors, smaller alpha and depth parts.
 pub fn random_image_gradients(rng: &mut Pcg64, pixels: usize) -> ImageGradients<f32> {
     ImageGradients {
         v_color: (0..pixels).map(|_| std::array::from_fn(|_| normal(rng) as f32)).collect(),
@@ -386,7 +386,7 @@ fn bytemuck_rows(values: &[f32]) -> &[[f32; 1]] {
     values.as_chunks::<1>().0
 }
 
-/// Difference of two pictures (colour, alpha, transmittance; depth as a part of the largest),
+/// Difference of two pictures (color, alpha, transmittance; depth as a part of the largest),
 /// pixels in `band` left out.
 pub fn image_difference(got: &Image<f32>, expected: &Image<f64>, band: &[bool]) -> Difference {
     assert_eq!((got.width, got.height), (expected.width, expected.height));

@@ -1,15 +1,15 @@
-//! Colours of splats that a step does not see take its update later; no bit may tell.
+//! Colors of splats that a step does not see take its update later; no bit may tell.
 
 use splat_render::fit::{
     COLOR_WAIT, DensityStats, FitDevice, FitState, McmcRun, OriginalRun, Rates, StepInput,
 };
 
-use super::optimisation::{random_adam, random_target};
+use super::optimization::{random_adam, random_target};
 use super::*;
 
 const STEPS: u32 = 2 * COLOR_WAIT as u32 + 30;
 /// After these steps the degree grows, and in those nothing moves: both end all waiting, and between them
-/// it lasts longer than colours may wait.
+/// it lasts longer than colors may wait.
 const GROWS: [u32; 2] = [20, STEPS - 50];
 const FROZEN: [u32; 3] = [3, 200, STEPS - 20];
 const _: () = assert!(FROZEN[1] - GROWS[0] > COLOR_WAIT as u32 + 1);
@@ -38,7 +38,7 @@ fn begin(device: &mut dyn FitDevice, seed: u64) -> (Vec<Camera>, FitState) {
     (cameras, state)
 }
 
-/// One photo for longer than colours may wait, then all in turn; the degree grows, rates fall, some steps
+/// One photo for longer than colors may wait, then all in turn; the degree grows, rates fall, some steps
 /// move nothing.
 fn input(cameras: &[Camera], step: u32) -> StepInput {
     let view = if step <= STEPS / 2 + 10 { 0 } else { step as usize % cameras.len() };
@@ -95,7 +95,7 @@ fn end(device: &mut dyn FitDevice, control: &[u32], resume: &[u32], frozen: usiz
     device.download().unwrap()
 }
 
-/// `device` makes a device whose colours wait for so many steps at most.
+/// `device` makes a device whose colors wait for so many steps at most.
 pub fn waiting_colors_end_with_the_same_bits<D: FitDevice>(device: impl Fn(usize) -> D) {
     let (cameras, before) = begin(&mut device(COLOR_WAIT), 31);
     let mut first = device(COLOR_WAIT);

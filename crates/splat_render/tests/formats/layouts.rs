@@ -69,9 +69,9 @@ pub fn ksplat(file: &SplatFile, level: u16) -> Vec<u8> {
     for _ in 0..partial {
         out.extend(1u32.to_le_bytes());
     }
-    let centre = |i: usize| splats.means[i / BUCKET * BUCKET].map(|c| (c * 4.0).round() / 4.0);
+    let center = |i: usize| splats.means[i / BUCKET * BUCKET].map(|c| (c * 4.0).round() / 4.0);
     for bucket in 0..full + partial {
-        out.extend(centre(bucket * BUCKET).into_iter().flat_map(f32::to_le_bytes));
+        out.extend(center(bucket * BUCKET).into_iter().flat_map(f32::to_le_bytes));
     }
     for i in 0..n {
         let push = |out: &mut Vec<u8>, value: f32| match level {
@@ -82,7 +82,7 @@ pub fn ksplat(file: &SplatFile, level: u16) -> Vec<u8> {
             match level {
                 0 => out.extend(splats.means[i][k].to_le_bytes()),
                 _ => {
-                    let steps = (splats.means[i][k] - centre(i)[k]) / (block / 2.0 / 32767.0);
+                    let steps = (splats.means[i][k] - center(i)[k]) / (block / 2.0 / 32767.0);
                     out.extend(((steps + 32767.0).round() as u16).to_le_bytes());
                 }
             }
@@ -114,7 +114,7 @@ pub fn ksplat(file: &SplatFile, level: u16) -> Vec<u8> {
 fn ksplat_of_every_level_and_degree() {
     for level in 0..3 {
         for degree in 0..=2 {
-            // All within 4 units of the bucket's centre.
+            // All within 4 units of the bucket's center.
             let mut file = scene(31, degree);
             for mean in &mut file.splats.means {
                 *mean = mean.map(|c| c / 2.0);

@@ -73,7 +73,7 @@ fn values_beyond_the_range_are_clipped_and_counted() {
             .collect::<Vec<_>>()
     };
     assert_eq!(counts("compressed.ply"), [2, 1]); // log-scales beyond 20, SH beyond 4
-    assert_eq!(counts("splat"), [1]); // colours
+    assert_eq!(counts("splat"), [1]); // colors
     assert_eq!(counts("spz"), [2, 2, 2]); // DC, log-scales, SH
     assert_eq!(counts("sog"), [0usize; 0]);
     assert_eq!(counts("glb"), [0usize; 0]);

@@ -53,7 +53,7 @@ impl Numbers {
     }
 }
 
-/// Splats of SH degree 1 in a ball about the origin, of colours about `tint`.
+/// Splats of SH degree 1 in a ball about the origin, of colors about `tint`.
 pub fn ball(count: usize, seed: u64, tint: [f32; 3]) -> SplatFile {
     let mut n = Numbers(seed);
     let mut splats = SplatArrays { sh_degree: 1, ..SplatArrays::default() };

@@ -8,7 +8,7 @@ use crate::camera::Camera;
 const ONE_PLACE: f64 = 1e-3;
 
 /// Moves all cameras by the similarity that brings them nearest to where they began: orientations
-/// on average, centres in the least-squares sense. Cameras that stand at one place, seen from their
+/// on average, centers in the least-squares sense. Cameras that stand at one place, seen from their
 /// distances to the scene, have no scale to keep.
 pub(super) fn anchor(now: &mut [Camera], initial: &[Camera], distances: &[f64]) {
     let n = now.len() as f64;

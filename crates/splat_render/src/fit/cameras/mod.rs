@@ -1,6 +1,6 @@
-//! Cameras under optimisation: poses and focal lengths that are not exact, fitted with the splats.
+//! Cameras under optimization: poses and focal lengths that are not exact, fitted with the splats.
 //!
-//! A camera turns about its own centre and moves along its own axes. Both show the scene in nearly
+//! A camera turns about its own center and moves along its own axes. Both show the scene in nearly
 //! the same way, so Adam does not work on them but on coordinates in which every unit step moves the
 //! picture of the scene by one pixel, whichever way it points (as CamP, Park et al. 2023).
 //!
@@ -100,7 +100,7 @@ impl Cameras {
     ///
     /// # Errors
     /// [`Error::Argument`] if there is not a number for each, or cameras of one number do not share a
-    /// centre.
+    /// center.
     pub fn set_rigs(&mut self, numbers: &[u32]) -> Result<()> {
         self.rigs = Rigs::new(&self.initial, numbers, &self.state.distances)?;
         self.scales = all_scales(&self.initial, &self.state.distances, &self.priors, &self.rigs);

@@ -1,7 +1,7 @@
-//! Pose priors: what is known of a camera besides the photos' colours.
+//! Pose priors: what is known of a camera besides the photos' colors.
 //!
 //! Points that were matched in several photos tell a camera's pose to hundredths of a pixel, which
-//! the colours of a fit do not. A camera with a prior takes small steps along what is known and steps
+//! the colors of a fit do not. A camera with a prior takes small steps along what is known and steps
 //! as large as ever along what is not. It is also drawn back towards the prior's mean: so far that a
 //! steady push ends one standard deviation away.
 

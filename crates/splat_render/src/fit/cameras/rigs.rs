@@ -1,4 +1,4 @@
-//! Rigs: cameras that share one centre and move as one, as the views of a panorama do.
+//! Rigs: cameras that share one center and move as one, as the views of a panorama do.
 //!
 //! All members take the step of the whole, each in its own axes: gradients, measures and priors are
 //! brought to the axes of the rig's first camera, added up, and turned back.
@@ -9,9 +9,9 @@ use super::motion::{POSE, PoseMatrix};
 use crate::camera::Camera;
 use crate::error::{Error, Result};
 
-/// Centres of a rig's cameras are one if they differ by less than this part of how far they are from
+/// Centers of a rig's cameras are one if they differ by less than this part of how far they are from
 /// the origin, or from each other's scene.
-const ONE_CENTRE: f64 = 1e-5;
+const ONE_CENTER: f64 = 1e-5;
 
 /// Which cameras move as one.
 #[derive(Debug, Clone)]
@@ -39,8 +39,8 @@ impl Rigs {
             let first = numbers.iter().position(|other| other == number).unwrap_or(k);
             let (from, to) = (&cameras[first], &cameras[k]);
             let apart = from.center().distance(to.center());
-            if apart > ONE_CENTRE * (distances[k] + from.center().length()) {
-                return refused(format!("cameras {first} and {k} do not share a centre"));
+            if apart > ONE_CENTER * (distances[k] + from.center().length()) {
+                return refused(format!("cameras {first} and {k} do not share a center"));
             }
             rigs.first[k] = first;
             rigs.turn[k] = to.rotation() * from.rotation().transpose();

@@ -118,7 +118,7 @@ fn cameras_find_the_points_they_should_see() {
     assert!(after < 0.02 * before, "turns were {before:.2e} off and are {after:.2e}");
     for (a, b) in cameras.now().iter().zip(&truth) {
         let off = (a.center() - b.center()).length();
-        assert!(off < 1e-3, "a centre is {off:.2e} off");
+        assert!(off < 1e-3, "a center is {off:.2e} off");
         a.validate().unwrap();
     }
 }
@@ -268,7 +268,7 @@ fn a_state_resumes_and_a_wrong_one_is_refused() {
     assert!(second.resume(broken).is_err());
 }
 
-/// Three cameras at one centre that look up to 0.7 radians apart, for each camera of a ring.
+/// Three cameras at one center that look up to 0.7 radians apart, for each camera of a ring.
 fn rigs(n: usize) -> (Vec<Camera>, Vec<u32>) {
     let turned = |camera: &Camera, angle: f64| {
         let turn = DMat4::from_rotation_y(angle) * DMat4::from_rotation_z(0.5 * angle);
@@ -279,18 +279,18 @@ fn rigs(n: usize) -> (Vec<Camera>, Vec<u32>) {
     (views.collect(), (0..n as u32).flat_map(|k| [k; 3]).collect())
 }
 
-/// Largest change of a turn between cameras of a rig, and of the distance between their centres.
+/// Largest change of a turn between cameras of a rig, and of the distance between their centers.
 fn bend(a: &[Camera], b: &[Camera], numbers: &[u32]) -> (f64, f64) {
-    let (mut turns, mut centres) = (0.0_f64, 0.0_f64);
+    let (mut turns, mut centers) = (0.0_f64, 0.0_f64);
     for k in 1..a.len() {
         if numbers[k] == numbers[k - 1] {
             let within = |c: &[Camera]| c[k].rotation() * c[k - 1].rotation().transpose();
             let off = within(a) - within(b);
             turns = turns.max(off.to_cols_array().map(f64::abs).into_iter().fold(0.0, f64::max));
-            centres = centres.max(a[k].center().distance(a[k - 1].center()));
+            centers = centers.max(a[k].center().distance(a[k - 1].center()));
         }
     }
-    (turns, centres)
+    (turns, centers)
 }
 
 #[test]
@@ -313,8 +313,8 @@ fn rigs_find_the_points_and_keep_their_shape() {
     fitted(&mut cameras, &truth, 1000);
     let after = worst_angle(cameras.now(), &truth);
     assert!(after < 0.02 * before, "turns were {before:.2e} off and are {after:.2e}");
-    let (turns, centres) = bend(cameras.now(), &truth, &numbers);
-    assert!(turns < 1e-9 && centres < 1e-9, "a rig bent by {turns:.1e} and {centres:.1e}");
+    let (turns, centers) = bend(cameras.now(), &truth, &numbers);
+    assert!(turns < 1e-9 && centers < 1e-9, "a rig bent by {turns:.1e} and {centers:.1e}");
 
     // Without rigs, noisy gradients pull its cameras apart.
     let mut free = Cameras::new(&noisy, vec![4.0; 12], off);
@@ -347,14 +347,14 @@ fn a_prior_of_one_camera_holds_its_rig() {
     fitted(&mut cameras, &pushed, 100);
     let moved = worst_angle(cameras.now(), &told);
     assert!(moved < 0.002, "known rigs turned by {moved:.2e}");
-    let (turns, centres) = bend(cameras.now(), &told, &numbers);
-    assert!(turns < 1e-9 && centres < 1e-9);
+    let (turns, centers) = bend(cameras.now(), &told, &numbers);
+    assert!(turns < 1e-9 && centers < 1e-9);
 }
 
 #[test]
 fn rigs_of_cameras_that_stand_apart_are_refused() {
     let mut cameras = Cameras::new(&ring(3), vec![4.0; 3], config());
     assert!(cameras.set_rigs(&[0, 1]).unwrap_err().to_string().contains("one number for each"));
-    assert!(cameras.set_rigs(&[0, 1, 0]).unwrap_err().to_string().contains("share a centre"));
+    assert!(cameras.set_rigs(&[0, 1, 0]).unwrap_err().to_string().contains("share a center"));
     cameras.set_rigs(&[0, 1, 2]).unwrap();
 }

@@ -5,10 +5,10 @@
 //! and leaves the state as it was, as do the steps after it; the host looks at that flag now and
 //! then, makes room and repeats those steps, so that no step waits for a read-back.
 //!
-//! Colours of splats that a step does not see wait ([`crate::fit_device::COLOR_WAIT`]).
+//! Colors of splats that a step does not see wait ([`crate::fit_device::COLOR_WAIT`]).
 //!
 //! Memory. Per splat with K SH coefficients, the parameters are P = 4 (11 + 3 K) bytes: P and two moments
-//! make 3 P; statistics, the gradient of a colour, 2D splats, their gradients and the depth order take
+//! make 3 P; statistics, the gradient of a color, 2D splats, their gradients and the depth order take
 //! 144. A (splat, tile) pair has 60 bytes, 40 of them its gradient slot; there is room for 4 per
 //! splat at first, later for a quarter more than any step has needed. A pixel has 84 bytes, 36 of them
 //! slopes of SSIM (96 and 48 on software adapters), 16 more where exposures are fitted and
@@ -64,11 +64,11 @@ pub struct GpuFit {
     scene: Option<Scene>,
     /// MCMC's table of shares; None until density control runs.
     shares: Option<wgpu::Buffer>,
-    /// Steps not known to have been done, with the number of those that colours waited for before.
+    /// Steps not known to have been done, with the number of those that colors waited for before.
     pending: Vec<(StepInput, usize)>,
     /// While pending steps are done again: the last of them that was submitted again.
     redone: Option<usize>,
-    /// The steps that colours may wait for, those that are pending included.
+    /// The steps that colors may wait for, those that are pending included.
     waiting: WaitingSteps,
     camera_gradients: Vec<CameraGradient>,
     exposure_gradients: Vec<ExposureGradient>,
@@ -121,7 +121,7 @@ impl GpuFit {
         }
     }
 
-    /// Colours of splats that are not seen wait for at most so many steps, by default
+    /// Colors of splats that are not seen wait for at most so many steps, by default
     /// [`COLOR_WAIT`](crate::fit::COLOR_WAIT); with 1, all are brought up to date in every step. Bits are
     /// the same.
     pub fn with_color_wait(self, steps: usize) -> Self {
@@ -134,7 +134,7 @@ impl GpuFit {
             .ok_or_else(|| Error::argument("splats", "have not been uploaded to the device"))
     }
 
-    /// Brings all colours up to date; all steps must be done.
+    /// Brings all colors up to date; all steps must be done.
     fn catch_up(&mut self) -> Result<()> {
         if self.waiting.get().is_empty() {
             return Ok(());
@@ -151,7 +151,7 @@ impl GpuFit {
         Ok(())
     }
 
-    /// Submits one step without waiting for it, as number `at` of those pending; colours wait for
+    /// Submits one step without waiting for it, as number `at` of those pending; colors wait for
     /// `waiting` steps before it. `again` where its pairs did not fit before.
     fn enqueue(&mut self, input: &StepInput, at: usize, waiting: usize, again: bool) -> Result<()> {
         let scene = self

@@ -33,7 +33,7 @@ pub(super) struct Scene {
     pub pairs: PairBins,
     pub slots: wgpu::Buffer,
     pub capacity: u32,
-    /// What brings all colours up to date. Empty until needed, and again whenever a buffer was replaced.
+    /// What brings all colors up to date. Empty until needed, and again whenever a buffer was replaced.
     pub catch_up: Vec<Op>,
 }
 
@@ -159,7 +159,7 @@ impl Scene {
         Ok((next, ops))
     }
 
-    /// Makes the commands that bring all colours up to date, unless they are there already.
+    /// Makes the commands that bring all colors up to date, unless they are there already.
     pub fn prepare(&mut self, gpu: &Gpu, view: &wgpu::Buffer, color_steps: &wgpu::Buffer) {
         if self.catch_up.is_empty() {
             let drawn = Projection { view, splats2d: &self.splats2d };
@@ -177,7 +177,7 @@ impl Scene {
         u64::from(camera_sums(self.len())) * CAMERA as u64 * 4
     }
 
-    /// The state as it is now; all steps must be done, and all colours up to date.
+    /// The state as it is now; all steps must be done, and all colors up to date.
     pub fn download(&self, gpu: &Gpu) -> Result<FitState> {
         let ([splats, first, second], stats) = self.adam.download(gpu, &[], self.sh_degree)?;
         Ok(FitState {

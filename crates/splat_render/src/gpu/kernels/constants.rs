@@ -81,7 +81,7 @@ pub(super) fn constants(rows: u32) -> String {
     for (i, tap) in SSIM_WINDOW.iter().take(SSIM_WINDOW.len() / 2 + 1).enumerate() {
         let _ = writeln!(out, "const SSIM_TAP_{i} = {tap:e}f;");
     }
-    // Weights of each of the 14 values that four neighbouring outputs of SSIM's filter need.
+    // Weights of each of the 14 values that four neighboring outputs of SSIM's filter need.
     let tap = |k: usize, output: usize| {
         let weight = k.checked_sub(output).and_then(|k| SSIM_WINDOW.get(k)).unwrap_or(&0.0);
         format!("{weight:e}f")

@@ -40,7 +40,7 @@ fn bits_or(low: vec3<f32>, high: vec3<f32>, k: u32) -> f32 {
     return out;
 }
 
-// The box of the finite centres, a part for each workgroup.
+// The box of the finite centers, a part for each workgroup.
 @compute @workgroup_size(THREADS)
 fn density_bounds(
     @builtin(workgroup_id) workgroup: vec3<u32>,

@@ -9,13 +9,13 @@ struct DepthStep {
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> step: DepthStep;
-// Colours (xyz) and transmittance (w).
+// Colors (xyz) and transmittance (w).
 @group(0) @binding(2) var<storage, read> picture: array<vec4<f32>>;
 // Accumulated depths.
 @group(0) @binding(3) var<storage, read> depths: array<f32>;
 // The photo's depth and its confidence, 0 where it is not known.
 @group(0) @binding(4) var<storage, read> photo: array<vec2<f32>>;
-// Gradients of colour (xyz) and accumulated depth (w).
+// Gradients of color (xyz) and accumulated depth (w).
 @group(0) @binding(5) var<storage, read_write> v_picture: array<vec4<f32>>;
 // As rasterize_backward reads them.
 @group(0) @binding(6) var<storage, read_write> totals: array<f32>;

@@ -1,5 +1,5 @@
-// exposure and exposure_backward: a picture's colours as a photo of some gain and offset has them,
-// and back from the gradients of those colours to the picture's. Sums of gain and offset: each
+// exposure and exposure_backward: a picture's colors as a photo of some gain and offset has them,
+// and back from the gradients of those colors to the picture's. Sums of gain and offset: each
 // thread adds up pixels that lie a stride apart, a workgroup its threads in order, the host the groups.
 // Follows shared.wgsl.
 
@@ -7,18 +7,18 @@
 struct Exposure {
     gain: vec4<f32>,
     offset: vec4<f32>,
-    // How a colour grows with the transmittance.
+    // How a color grows with the transmittance.
     behind: vec4<f32>,
     background: vec4<f32>,
 }
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> exposed: Exposure;
-// Colours (xyz) and transmittance (w).
+// Colors (xyz) and transmittance (w).
 @group(0) @binding(2) var<storage, read> picture: array<vec4<f32>>;
-// Colours a photo has (xyz) and, from backward, the gradient of alpha (w).
+// Colors a photo has (xyz) and, from backward, the gradient of alpha (w).
 @group(0) @binding(3) var<storage, read_write> corrected: array<vec4<f32>>;
-// Gradients: of the corrected colours before, of the picture's after.
+// Gradients: of the corrected colors before, of the picture's after.
 @group(0) @binding(4) var<storage, read_write> v_picture: array<vec4<f32>>;
 // As rasterize_backward reads them.
 @group(0) @binding(5) var<storage, read_write> totals: array<f32>;
@@ -59,7 +59,7 @@ fn exposure_backward(
         let pixel = picture[i];
         let before = raw(pixel);
         let gradient = v_picture[i].xyz;
-        // What takes a cut colour further away from what a photo holds stays behind.
+        // What takes a cut color further away from what a photo holds stays behind.
         // Brackets, or "<" and ">" of one expression open and close a template list.
         let over = (before > vec3(1.0)) & (gradient < vec3(0.0));
         let under = (before < vec3(0.0)) & (gradient > vec3(0.0));

@@ -1,11 +1,11 @@
 // What both directions of the project stage need of one splat, and its spherical harmonics. Declared
 // before are `geometry`, GEOMETRY floats per splat: mean 3, scales 3, quaternion 4 (wxyz), opacity 1; and
-// `colors`, 3 floats per coefficient, `sh_stride` coefficients per splat (1 for direct colours).
+// `colors`, 3 floats per coefficient, `sh_stride` coefficients per splat (1 for direct colors).
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> window: Window;
 
-// How colours and parameters are stored, as `look_up_mode` has it from the view.
+// How colors and parameters are stored, as `look_up_mode` has it from the view.
 struct Mode {
     sh_degree: u32,
     sh_stride: u32,
@@ -27,11 +27,11 @@ fn look_up_mode(workgroup: vec3<u32>) {
 
 struct Geometry {
     visible: bool,
-    // Camera-space centre.
+    // Camera-space center.
     t: vec3<f32>,
     // Columns: the splat's axes in the world.
     axes: mat3x3<f32>,
-    quat: vec4<f32>, // wxyz, normalised
+    quat: vec4<f32>, // wxyz, normalized
     quat_norm: f32,
     scales: vec3<f32>,
     opacity: f32,
@@ -164,7 +164,7 @@ fn root_dets(g: Geometry) -> vec2<f32> {
     return largest * vec2(length(area / largest), length(vec4(area, rest) / largest));
 }
 
-// R^T t is the vector from the camera's centre to the mean, without the cancellation of
+// R^T t is the vector from the camera's center to the mean, without the cancellation of
 // subtracting two far-away points. Length in w.
 fn view_direction(t: vec3<f32>) -> vec4<f32> {
     let largest = max(max(abs(t.x), abs(t.y)), abs(t.z));
@@ -294,7 +294,7 @@ fn sh_degree_four(d: vec3<f32>) -> array<Term, 9> {
     );
 }
 
-// SH colour before the cut at zero.
+// SH color before the cut at zero.
 fn sh_color(local: u32, direction: vec3<f32>) -> vec3<f32> {
     let row = local * mode.sh_stride;
     var color = SH_C0 * coefficient(row);

@@ -4,7 +4,7 @@
 // at once through the filter again, then down the columns of that. Follows loss_pixels.wgsl.
 
 const THREADS = 8u;
-// Taps on each side of the window's centre.
+// Taps on each side of the window's center.
 const HALF = 5u;
 // Floats of a pixel between passes: filtered x, y, xx + yy and xy; then derivatives of the weighted SSIM
 // sum by the filtered x, xx and xy.

@@ -1,5 +1,5 @@
 // MCMC's density control, second part: dead splats, and fresh ones behind the others, become copies of
-// splats that are drawn by weight, and all copies share opacity and size. Colours and moments stay where
+// splats that are drawn by weight, and all copies share opacity and size. Colors and moments stay where
 // they are until all are put in order; `rows` keeps where they come from. As fit_device/mcmc.rs, bit for
 // bit. Follows shared.wgsl and mcmc_run.wgsl.
 
@@ -10,7 +10,7 @@
 @group(0) @binding(4) var<storage, read> totals: array<vec2<u32>, 2>;
 @group(0) @binding(5) var<storage, read_write> copies: array<atomic<u32>>;
 @group(0) @binding(6) var<storage, read_write> sources: array<u32>;
-// Twice the row of a splat's colours, and 1 where its moments are to be zero.
+// Twice the row of a splat's colors, and 1 where its moments are to be zero.
 @group(0) @binding(7) var<storage, read_write> rows: array<u32>;
 // What is added to logit and log scales, by the bin of the logit and the number of shares from 2 on.
 @group(0) @binding(8) var<storage, read> shares: array<vec2<f32>>;

@@ -7,7 +7,7 @@
 @group(0) @binding(3) var<storage, read> cameras: array<FogCamera>;
 // What a living splat weighs, by the bin of its logit.
 @group(0) @binding(4) var<storage, read> table: array<u32>;
-// Weights, 0 of the dead. In `sample`, centres of the sampled splats.
+// Weights, 0 of the dead. In `sample`, centers of the sampled splats.
 @group(0) @binding(5) var<storage, read_write> words: array<u32>;
 
 struct FogCamera {
@@ -19,7 +19,7 @@ struct FogCamera {
     unused: f32,
 }
 
-// Centres of every `run.every` splats.
+// Centers of every `run.every` splats.
 @compute @workgroup_size(64)
 fn mcmc_sample(
     @builtin(workgroup_id) workgroup: vec3<u32>,

@@ -8,7 +8,7 @@
 // The numbers of both, each behind a sum.
 @group(0) @binding(5) var<storage, read> totals: array<vec2<u32>, 2>;
 @group(0) @binding(6) var<storage, read_write> drawn: array<f32>;
-// Twice the row of a splat's colours and moments, and 1 where its moments are to be zero.
+// Twice the row of a splat's colors and moments, and 1 where its moments are to be zero.
 @group(0) @binding(7) var<storage, read_write> rows: array<u32>;
 
 // A normal draw: the sum of twelve uniform ones, less its mean.

@@ -1,5 +1,5 @@
 // project: splats and camera to 2D splats. Follows geometry.wgsl, and waiting_colors.wgsl in fits, where
-// colours are brought up to date before they are evaluated.
+// colors are brought up to date before they are evaluated.
 
 // Of culled splats, the radii alone.
 @group(0) @binding(4) var<storage, read_write> splats2d: array<Splat2d>;

@@ -1,5 +1,5 @@
-// rasterize: every tile's splats, front to back, to colours, depth and final transmittance. A
-// thread owns four neighbouring pixels of each of ROWS rows, so that a splat is read once for all of
+// rasterize: every tile's splats, front to back, to colors, depth and final transmittance. A
+// thread owns four neighboring pixels of each of ROWS rows, so that a splat is read once for all of
 // them. Follows shared.wgsl and tile_memory.wgsl or tile_subgroup.wgsl.
 
 @group(0) @binding(0) var<uniform> view: View;
@@ -7,15 +7,15 @@
 @group(0) @binding(2) var<storage, read> splats2d: array<Splat2d>;
 @group(0) @binding(3) var<storage, read> tile_begin: array<u32>;
 @group(0) @binding(4) var<storage, read> splat_from_pair: array<u32>;
-// Colour over the background and final transmittance, row-major. Where a tile's list goes on in the
-// next dispatch: colour so far and transmittance, negative where the pixel has stopped.
+// Color over the background and final transmittance, row-major. Where a tile's list goes on in the
+// next dispatch: color so far and transmittance, negative where the pixel has stopped.
 @group(0) @binding(5) var<storage, read_write> picture: array<vec4<f32>>;
 @group(0) @binding(6) var<storage, read_write> depths: array<f32>;
 
 // In one row: llvmpipe fills its vectors along x alone.
 const THREADS = 64u / ROWS;
 
-// Four neighbouring pixels.
+// Four neighboring pixels.
 struct Quad {
     live: vec4<bool>,
     transmittance: vec4<f32>,

@@ -9,13 +9,13 @@
 @group(0) @binding(3) var<storage, read> tile_begin: array<u32>;
 @group(0) @binding(4) var<storage, read> splat_from_pair: array<u32>;
 @group(0) @binding(5) var<storage, read> slot_from_pair: array<u32>;
-// Gradients of colour (xyz) and accumulated depth (w).
+// Gradients of color (xyz) and accumulated depth (w).
 @group(0) @binding(6) var<storage, read> v_picture: array<vec4<f32>>;
-// Per pixel: colour . v_color + depth v_depth - transmittance v_alpha, background included; less
+// Per pixel: color . v_color + depth v_depth - transmittance v_alpha, background included; less
 // what has been walked where a tile's list goes on in the next dispatch.
 @group(0) @binding(7) var<storage, read_write> totals: array<f32>;
 // SUMS floats per slot: sums of g u, g v, g u^2, g u v, g v^2 with g the gradient of sigma, then
-// depth, colour 3, opacity, and where asked for the absolute gradients of the mean: |g u| (times p
+// depth, color 3, opacity, and where asked for the absolute gradients of the mean: |g u| (times p
 // that of x) and that of y.
 @group(0) @binding(8) var<storage, read_write> slots: array<f32>;
 // Between such dispatches: transmittance, negative where the pixel has stopped.
@@ -24,7 +24,7 @@
 // In one row: llvmpipe fills its vectors along x alone.
 const THREADS = 64u / ROWS;
 
-// Four neighbouring pixels.
+// Four neighboring pixels.
 struct Quad {
     center_x: vec4<f32>,
     center_y: f32,

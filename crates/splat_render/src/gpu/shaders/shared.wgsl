@@ -1,7 +1,7 @@
 // Structs and functions that several stages share. The constants that precede this text are
 // written from constants.rs and sh.rs; layout.rs holds the Rust twins of the structs.
 
-// A camera, the picture's background and how colours and parameters are stored.
+// A camera, the picture's background and how colors and parameters are stored.
 struct View {
     // Rows of the world-to-camera matrix.
     world_to_camera: array<vec4<f32>, 3>,
@@ -17,7 +17,7 @@ struct View {
     height: u32,
     tiles_x: u32,
     sh_degree: u32,
-    // Stored coefficients per splat, 0 for direct colours.
+    // Stored coefficients per splat, 0 for direct colors.
     sh_stride: u32,
     // 1 where scales are logarithms and opacities logits.
     raw: u32,
@@ -87,7 +87,7 @@ struct Step {
     sh_rest: f32,
     bias_first: f32,
     bias_second: f32,
-    // Gradients of the regularisers by one opacity and one scale.
+    // Gradients of the regularizers by one opacity and one scale.
     opacity_pull: f32,
     scale_pull: f32,
     noise: f32,

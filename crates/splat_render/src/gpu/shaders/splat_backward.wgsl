@@ -6,8 +6,8 @@
 struct Backward {
     geometry: array<f32, GEOMETRY>,
     camera: array<f32, CAMERA>,
-    // Of the colour before the cut at zero, and the direction it is seen along: the gradient of each
-    // coefficient is its basis function there times that of the colour.
+    // Of the color before the cut at zero, and the direction it is seen along: the gradient of each
+    // coefficient is its basis function there times that of the color.
     v_color: vec3<f32>,
     direction: vec3<f32>,
     // Whether there is a gradient at all.
@@ -121,7 +121,7 @@ fn splat_backward(i: u32) -> Backward {
     var v_rotation = mat3x3<f32>();
     var finite = true;
 
-    // Colour and, through the view direction, t and the rotation.
+    // Color and, through the view direction, t and the rotation.
     var direction = vec4(0.0);
     if mode.sh_stride == 0u {
         keep_coefficient(i, v_color);
@@ -177,7 +177,7 @@ fn splat_backward(i: u32) -> Backward {
     let v_b0 = v_m0 * g.scales;
     let v_b1 = v_m1 * g.scales;
 
-    // Axes -> quaternion, through its normalisation.
+    // Axes -> quaternion, through its normalization.
     let v_unit = quat_gradient(g.quat, outer(g.a0, v_b0) + outer(g.a1, v_b1));
     let v_quat = (v_unit - dot(v_unit, g.quat) * g.quat) / g.quat_norm;
 
@@ -215,7 +215,7 @@ fn splat_backward(i: u32) -> Backward {
         v_principal.y -= v_ratio.y / view.focal.y;
     }
 
-    // Centre and depth.
+    // Center and depth.
     v_focal += v_center * xy;
     v_principal += v_center;
     v_t += vec3(v_center * per_z, v_depth - dot(v_center * per_z, xy));

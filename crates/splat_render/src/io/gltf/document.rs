@@ -111,7 +111,7 @@ impl<'a> Document<'a> {
                 Some(&place) => (place, None),
                 None => {
                     files.insert(uri.to_owned(), next);
-                    (next, Some(Cow::Owned(self.neighbour(uri)?)))
+                    (next, Some(Cow::Owned(self.neighbor(uri)?)))
                 }
             },
             (None, _, Some(binary)) if k == 0 => (next, Some(Cow::Borrowed(binary))),
@@ -128,7 +128,7 @@ impl<'a> Document<'a> {
     }
 
     /// The bytes of a file in the same folder or below it.
-    fn neighbour(&self, uri: &str) -> Result<Vec<u8>> {
+    fn neighbor(&self, uri: &str) -> Result<Vec<u8>> {
         use std::io::Read;
         let name = percent_decoded(uri);
         let plain = Path::new(&name).components().all(|part| matches!(part, Component::Normal(_)));

@@ -106,7 +106,7 @@ fn check_extension(
     match extension.get("colorSpace").and_then(Value::as_str) {
         None | Some(COLOR_SPACE) => {}
         Some(space) => {
-            let note = format!("Colours of the space {space:?} are taken for {COLOR_SPACE:?}.");
+            let note = format!("Colors of the space {space:?} are taken for {COLOR_SPACE:?}.");
             if !notes.contains(&note) {
                 notes.push(note);
             }

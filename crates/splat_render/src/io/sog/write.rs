@@ -28,7 +28,7 @@ const SH0: &str = "sh0.webp";
 const CENTROIDS: &str = "shN_centroids.webp";
 const LABELS: &str = "shN_labels.webp";
 
-/// The whole file. Splats are put in Morton's order: images of neighbours compress better.
+/// The whole file. Splats are put in Morton's order: images of neighbors compress better.
 pub fn encode(file: &SplatFile, notes: &mut Vec<String>) -> Result<Vec<u8>> {
     let prepared = prepare(file, &ROOM, notes);
     let splats = prepared.select(&morton_order(&prepared.means));

@@ -41,7 +41,7 @@ pub fn random_target(
     }
 }
 
-/// A picture of random colours in 0..1.
+/// A picture of random colors in 0..1.
 pub fn random_picture(rng: &mut Pcg64, width: u32, height: u32) -> Image<f32> {
     let pixels = (width * height) as usize;
     Image {
@@ -186,7 +186,7 @@ pub fn depth_loss_matches_the_reference(stages: &dyn Stages<f32>) {
     assert!(error.starts_with("target: has depths"), "{error}");
 }
 
-/// Splats under optimisation, with moments of earlier steps, and gradients.
+/// Splats under optimization, with moments of earlier steps, and gradients.
 pub fn random_adam(
     rng: &mut Pcg64,
     n: usize,
