@@ -1,4 +1,4 @@
-//! Backends: which implementation of the stages runs, and on what.
+//! Backends: the implementation of the stages and its device.
 
 use std::ffi::CString;
 use std::sync::{Arc, LazyLock, Mutex, MutexGuard, PoisonError};
@@ -40,17 +40,17 @@ impl Backend {
     }
 }
 
-/// What became of opening a device.
+/// The result of opening a device.
 type Opened = Result<Arc<Gpu>, Error>;
 
-/// Devices of this process: the best real one, and the one that "gpu" names where there is none.
+/// Devices of this process: the best real one, and the one for "gpu", which may be a software adapter.
 #[derive(Default)]
 struct Devices {
     real: Option<Opened>,
     software: Option<Opened>,
-    /// Whether the user was told why "auto" is not the GPU.
+    /// Whether a warning has said why "auto" is not the GPU.
     warned: bool,
-    /// What tests make of the adapters.
+    /// Faults injected by tests.
     injected: Injected,
 }
 
@@ -58,7 +58,7 @@ static DEVICES: LazyLock<Mutex<Devices>> = LazyLock::new(Mutex::default);
 
 impl Devices {
     fn lock() -> MutexGuard<'static, Self> {
-        // What is opened is opened whole.
+        // A panic leaves no half-open device.
         DEVICES.lock().unwrap_or_else(PoisonError::into_inner)
     }
 

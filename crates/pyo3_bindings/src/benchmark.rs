@@ -1,5 +1,5 @@
-//! What only the benchmark needs: stages timed without the conversion of arrays, the machine's peak
-//! speed, and the pixels at which implementations may differ by rounding.
+//! Functions for benchmarks: stages timed without array conversion, the machine's peak speed, and pixels
+//! at which rounding may change the picture.
 
 use std::time::{Duration, Instant};
 
@@ -45,14 +45,14 @@ pub fn band_pixels<'py>(
     shaped(py, bytes, &[height as usize, width as usize])
 }
 
-/// Milliseconds of one call, and what it returned.
+/// Milliseconds of one call, and its result.
 fn timed<R>(call: impl FnOnce() -> Result<R>) -> Result<(f64, R)> {
     let started = Instant::now();
     let value = call()?;
     Ok((started.elapsed().as_secs_f64() * 1e3, value))
 }
 
-/// What the timed backward stages start from, and how often stages run.
+/// Inputs of the timed backward stages, and the number of repeats.
 struct Timing<'py> {
     background: Bound<'py, PyAny>,
     v_image: PictureGradients<'py>,

@@ -10,8 +10,8 @@ macro_rules! file {
     };
 }
 
-/// Names within the capture's folder, and contents. The photos are those that
-/// `igsr refine examples/tea_table --photos 8` takes, and all that are held out.
+/// File names within the capture's folder, and contents: the photos of `igsr refine examples/tea_table
+/// --photos 8` and all held-out photos.
 const FILES: &[(&str, &[u8])] = &[
     file!("transforms_train.json"),
     file!("transforms_test.json"),

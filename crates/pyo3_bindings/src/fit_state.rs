@@ -63,8 +63,8 @@ pub fn camera_state_from(dict: &Bound<'_, PyDict>, count: usize) -> PyResult<Opt
 /// Starts of exposures and the pulls to them.
 pub type ExposureStarts = (Vec<Option<Exposure<f64>>>, Vec<f64>);
 
-/// Where exposures start: `gains` [V, 3], `offsets` [V, 3], `fitted` [V], False for photos that have
-/// none of their own, and `pulls` [V] to the starts.
+/// Initial exposures: `gains` [V, 3], `offsets` [V, 3], `fitted` [V] (False for photos without an initial
+/// exposure) and `pulls` [V] toward the initial values.
 pub fn exposures_from(dict: &Bound<'_, PyDict>, count: usize) -> PyResult<ExposureStarts> {
     let n = count as isize;
     let gains = entry::<f64>(dict, "gains")?;
@@ -105,7 +105,7 @@ pub fn exposure_state_from(
     }))
 }
 
-/// Writes what [`exposure_state_from`] reads.
+/// Writes the entries that [`exposure_state_from`] reads.
 pub fn set_exposure_state(dict: &Bound<'_, PyDict>, state: ExposureState) -> PyResult<()> {
     let (py, n) = (dict.py(), state.gains.len());
     dict.set_item("exposure_gains", shaped_rows(py, state.gains, &[n])?)?;
@@ -141,7 +141,7 @@ pub fn holds_from(dict: &Bound<'_, PyDict>, count: usize) -> PyResult<Vec<PosePr
     Ok((0..count).map(hold).collect())
 }
 
-/// Writes what [`camera_state_from`] reads.
+/// Writes the entries that [`camera_state_from`] reads.
 pub fn set_camera_state(dict: &Bound<'_, PyDict>, state: CameraState) -> PyResult<()> {
     let (py, n) = (dict.py(), state.viewmats.len());
     set_cameras(dict, &state.viewmats, state.intrinsics)?;

@@ -50,7 +50,7 @@ impl Fitter {
 
 #[pymethods]
 impl Fitter {
-    /// A fit to photos, from parameters or from where an earlier fit stopped.
+    /// A fit to photos, started from splats or resumed from a state.
     #[new]
     #[pyo3(
         signature = (*positional, **named),
@@ -142,7 +142,7 @@ impl Fitter {
         Ok(dict)
     }
 
-    /// The exposures as they are now, where they are fitted: `gains` and `offsets`, [V, 3] each.
+    /// The current exposures if they are fitted: `gains` and `offsets`, [V, 3] each.
     fn exposures<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyDict>>> {
         let Some(state) = py.detach(|| self.lock()?.exposure_state().map_err(to_python))? else {
             return Ok(None);

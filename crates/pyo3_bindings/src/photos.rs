@@ -51,8 +51,8 @@ fn depths_from(call: &Call<'_>, count: usize) -> PyResult<Vec<Option<TargetDepth
     depths.iter().enumerate().map(depth).collect()
 }
 
-/// The photos of a fit: one entry each of `images`, `masks`, `backgrounds` and `schedule`,
-/// and of `depths`, where it is given.
+/// The photos of a fit: one entry each of `images`, `masks`, `backgrounds`, `schedule` and, if given,
+/// `depths`.
 pub fn targets_from(call: &Call<'_>) -> PyResult<Vec<Target>> {
     let (images, masks) =
         (call.take::<Bound<'_, PyList>>("images")?, call.take::<Bound<'_, PyList>>("masks")?);

@@ -42,7 +42,7 @@ pub fn splat_arrays_from(dict: &Bound<'_, PyDict>, prefix: &str) -> PyResult<Spl
     })
 }
 
-/// Writes what [`splat_arrays_from`] reads.
+/// Writes the entries that [`splat_arrays_from`] reads.
 pub fn set_splat_arrays(
     dict: &Bound<'_, PyDict>,
     prefix: &str,

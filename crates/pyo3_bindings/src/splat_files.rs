@@ -12,7 +12,7 @@ use crate::arrays::{array, row, rows, shaped};
 use crate::error::to_python;
 use crate::splat_arrays::{set_splat_arrays, splat_arrays_from};
 
-/// Reads a splat file of any format. `notes` say what was ignored.
+/// Reads a splat file of any format. `notes` list ignored content.
 #[pyfunction]
 pub fn read_splats<'py>(py: Python<'py>, path: PathBuf) -> PyResult<Bound<'py, PyDict>> {
     let loaded = py.detach(|| splat_render::io::read_splats(&path)).map_err(to_python)?;

@@ -16,7 +16,7 @@ pub const DEPTH_ALPHA: f32 = 0.5;
 /// No splat is fully opaque, so that `1 - alpha` stays invertible and gradients pass through it.
 pub const ALPHA_MAX: f32 = 0.99;
 
-/// A pixel stops before its transmittance would fall under this; what lies behind is invisible.
+/// A pixel stops before its transmittance falls below this; splats farther away are invisible.
 pub const TRANSMITTANCE_MIN: f32 = 1e-4;
 
 /// Default variance in px^2 added to both axes of every 2D covariance (EWA low-pass; gsplat's

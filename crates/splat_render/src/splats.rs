@@ -11,7 +11,7 @@ use crate::sh;
 pub enum Colors<'a, T> {
     /// Spherical harmonics; color = max(0, 0.5 + SH(direction from the camera to the mean)).
     Sh {
-        /// Degree that is evaluated, 0..=4; may be lower than what is stored.
+        /// Degree to evaluate, 0..=4; may be lower than the stored one.
         degree: u32,
         /// Stored coefficients per splat, at least `(degree + 1)^2`.
         stride: usize,
@@ -197,8 +197,7 @@ impl<'a> SplatSlices<'a> {
         }
     }
 
-    /// Borrowed as the stages take them, where they are raw parameters: SH of `degree` of `stride`
-    /// rows per splat.
+    /// Borrows raw parameters for the stages: SH of `degree` with `stride` rows per splat.
     pub fn params(&self, degree: u32, stride: usize) -> SplatParams<'_, f32> {
         SplatParams {
             means: self.means,
@@ -250,7 +249,7 @@ impl<T> SplatArrays<T> {
         sh::coeffs(self.sh_degree)
     }
 
-    /// Borrowed as the stages take them, evaluating SH up to `degree` (at most what is stored).
+    /// Borrows the parameters for the stages, with SH up to `degree`, capped at the stored one.
     pub fn params(&self, degree: u32) -> SplatParams<'_, T> {
         SplatParams {
             means: &self.means,

@@ -107,7 +107,7 @@ impl BlockStep {
         }
     }
 
-    /// Adds the regularizers' gradients to those of a block of splats.
+    /// Adds the regularizers' gradients to a block's gradients.
     pub fn pull(&self, values: &SplatSlices<'_>, gradients: &mut BlockGradients) {
         if self.opacity_pull == 0.0 && self.scale_pull == 0.0 {
             return;
@@ -160,7 +160,7 @@ impl BlockStep {
         if self.frozen {
             return;
         }
-        // Whole blocks at once where no coefficient rests.
+        // If all coefficients are in use, the rows are contiguous.
         let (values, row) = (values.sh.as_flattened_mut(), self.stored);
         let row = if self.used == row { values.len() } else { row };
         for start in (0..values.len()).step_by(row.max(1)) {
@@ -184,8 +184,8 @@ impl BlockStep {
     }
 }
 
-/// Adam's step (Kingma and Ba, 2015, algorithm 1) of numbers with their first and second moments: what
-/// all three become. Each operation rounds by itself, so that bits are the same on every machine.
+/// Adam's step (Kingma and Ba, 2015, algorithm 1): the new values, first and second moments. Operations
+/// are not fused, so that bits are the same on every machine.
 #[inline(always)]
 pub(super) fn step<S: Simd>(
     [value, first, second]: [Lanes<S>; 3],
@@ -200,7 +200,7 @@ pub(super) fn step<S: Simd>(
     [value - rate * (m * bias1) / size, m, v]
 }
 
-/// Adam on values, each with its own rate. All slices have room for as many as `values`.
+/// Adam on values with one rate each. All slices are at least as long as `values`.
 struct Adam<'a> {
     values: &'a mut [f32],
     first: &'a mut [f32],
@@ -294,7 +294,7 @@ impl<'a, S: Simd> StateVectors<'a, S> {
     }
 }
 
-/// What the regularizers pull at: log-scales and logits of a block, with their gradients.
+/// Log-scales and logits of a block with their gradients, for the regularizers.
 struct Pull<'a> {
     log_scales: &'a [f32],
     v_scales: &'a mut [f32],

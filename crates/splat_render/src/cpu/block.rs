@@ -75,14 +75,14 @@ impl Ids {
         self.len += 1;
     }
 
-    /// Appends `k` where `wanted`, without a branch.
+    /// Appends `k` if `wanted`, without a branch.
     #[inline(always)]
     pub fn push_if(&mut self, k: usize, wanted: bool) {
         self.ids[self.len] = k as u8;
         self.len += usize::from(wanted);
     }
 
-    /// Those of the first `count` splats.
+    /// The ids below `count`.
     pub fn below(&self, count: usize) -> Self {
         let len = self.get().partition_point(|&k| usize::from(k) < count);
         Self { len, ..*self }

@@ -18,8 +18,7 @@ fn power<S: Simd>(n: Lanes<S>) -> Lanes<S> {
     Lanes::new(s, s.transmute_f32s_u32s(s.wrapping_dyn_shl_u32s(bits, s.splat_u32s(23))))
 }
 
-/// e^x, relative error below 1e-7 where the result is normal: 0 and infinity where f32 holds
-/// no such number, NaN of NaN.
+/// e^x with relative error below 1e-7 for normal results; 0 and infinity outside f32's range; NaN of NaN.
 #[inline(always)]
 pub(super) fn exp<S: Simd>(x: Lanes<S>) -> Lanes<S> {
     // Of Cephes' expf: (e^r - 1 - r) / r^2 on |r| <= ln 2 / 2, from the highest power.

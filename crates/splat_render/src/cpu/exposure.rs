@@ -16,7 +16,7 @@ const LANES: usize = 16;
 pub(super) struct Exposed {
     /// R, G, B as the photo would have them.
     pub color: [Vec<f32>; 3],
-    /// Gradient with respect to the picture's alpha, where the photo has alpha.
+    /// Gradient with respect to the picture's alpha, for photos with alpha.
     pub v_alpha: Vec<f32>,
 }
 
@@ -45,8 +45,8 @@ impl Exposed {
         }
     }
 
-    /// Turns the gradients of the corrected colors into those of the picture, in place, with
-    /// `self.v_alpha`, and returns those of gain and offset.
+    /// Replaces the gradients of the corrected colors by the picture's, sets `self.v_alpha`, and returns
+    /// the gradients of gain and offset.
     pub fn backward(
         &mut self,
         image: &Planes,
@@ -109,7 +109,7 @@ struct Raw {
 }
 
 impl Raw {
-    /// What of a gradient goes back; see [`Exposure`].
+    /// The part of a gradient that passes the clamp; see [`Exposure`].
     #[inline(always)]
     fn passed(self, v: f32, color: f32, t: f32) -> f32 {
         Exposure::passed(self.gain * color + self.offset + t * self.behind, v)

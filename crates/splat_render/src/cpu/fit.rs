@@ -33,7 +33,7 @@ use crate::target::Target;
 pub struct CpuFit {
     targets: Vec<Target>,
     state: FitState,
-    /// The steps that colors may be behind the other parameters, and where each splat's are.
+    /// Steps that colors have not taken yet, and the state of each splat's colors.
     steps: WaitingSteps,
     waiting: Vec<WaitingColor>,
     loss_value: f32,
@@ -227,7 +227,7 @@ impl FitDevice for CpuFit {
     }
 }
 
-/// Which splats a step leaves out, and what it multiplies the others' opacities by.
+/// Selects the splats that a step drops, and scales the opacities of the rest.
 struct Dropout {
     seed: u32,
     rate: f32,
@@ -264,9 +264,9 @@ struct Scratch {
 }
 
 impl CpuFit {
-    /// Colors of splats that are not seen wait for at most so many steps, by default
-    /// [`COLOR_WAIT`](crate::fit::COLOR_WAIT); with 1, all are brought up to date in every step. Bits are
-    /// the same.
+    /// Sets the number of steps that colors of unseen splats may wait, by default
+    /// [`COLOR_WAIT`](crate::fit::COLOR_WAIT); with 1, every step updates all colors. The bits do not
+    /// change.
     pub fn with_color_wait(self, steps: usize) -> Self {
         Self { steps: WaitingSteps::at_most(steps), ..self }
     }
@@ -296,7 +296,7 @@ impl CpuFit {
         self.forget();
     }
 
-    /// Begins anew, from colors that are up to date.
+    /// Restarts the wait; all colors are up to date.
     fn forget(&mut self) {
         self.steps.clear();
         self.waiting.clear();

@@ -1,7 +1,7 @@
-//! Arithmetic on lanes: numbers and 3-vectors of as many splats as a vector register has room for.
+//! Arithmetic on lanes: numbers and 3-vectors of several splats, one splat per vector lane.
 //!
-//! Operators, so that formulas read as they do for one splat. They are functions that are always
-//! inlined, not closures, for the reason that `simd.rs` gives.
+//! Operators keep formulas readable. They are always-inlined functions, not closures, for the reason
+//! given in `simd.rs`.
 
 use std::ops::{Add, BitAnd, Div, Mul, Neg, Not, Sub};
 
@@ -51,7 +51,7 @@ impl<S: Simd> Lanes<S> {
         Self::splat(self.s, value)
     }
 
-    /// `self * factor + summand`, rounded once where there is an instruction for it.
+    /// `self * factor + summand`, rounded once if the machine has fused multiply-add.
     #[inline(always)]
     pub fn mul_add(self, factor: Self, summand: Self) -> Self {
         Self { s: self.s, v: self.s.mul_add_e_f32s(self.v, factor.v, summand.v) }
@@ -72,13 +72,13 @@ impl<S: Simd> Lanes<S> {
         Self { s: self.s, v: self.s.abs_f32s(self.v) }
     }
 
-    /// The smaller one; either where one is NaN.
+    /// The smaller one; either one if one is NaN.
     #[inline(always)]
     pub fn min(self, other: Self) -> Self {
         Self { s: self.s, v: self.s.min_f32s(self.v, other.v) }
     }
 
-    /// The larger one; either where one is NaN.
+    /// The larger one; either one if one is NaN.
     #[inline(always)]
     pub fn max(self, other: Self) -> Self {
         Self { s: self.s, v: self.s.max_f32s(self.v, other.v) }
@@ -118,13 +118,13 @@ impl<S: Simd> Number for Lanes<S> {
 }
 
 impl<S: Simd> Mask<S> {
-    /// `yes` where true, `no` elsewhere.
+    /// `yes` in true lanes, `no` elsewhere.
     #[inline(always)]
     pub fn select(self, yes: Lanes<S>, no: Lanes<S>) -> Lanes<S> {
         Lanes { s: self.s, v: self.s.select_f32s(self.v, yes.v, no.v) }
     }
 
-    /// `yes` where true, zero elsewhere.
+    /// `yes` in true lanes, zero elsewhere.
     #[inline(always)]
     pub fn keep(self, yes: Lanes<S>) -> Lanes<S> {
         self.select(yes, yes.all(0.0))

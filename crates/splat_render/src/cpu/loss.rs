@@ -19,8 +19,8 @@ use crate::constants::SSIM_C;
 use crate::stages::{self, Image};
 use crate::target::Target;
 
-/// Rows that a task is to have, about: the 2 [`HALF`] rows that it reads on either side of its own
-/// cost a tenth of them, and there are some tasks for each of many threads.
+/// Approximate rows per task. The 2 [`HALF`] extra rows that it reads on either side cost a tenth of
+/// this, and many threads get several tasks each.
 const BAND: usize = 96;
 
 /// The loss's gradient and scratch memory, kept from step to step.
@@ -28,7 +28,7 @@ const BAND: usize = 96;
 pub(super) struct Loss {
     /// Gradient of the loss with respect to each channel of the picture.
     pub v_color: [Vec<f32>; 3],
-    /// What tasks left behind that are done.
+    /// Scratch memory of finished tasks.
     scratch: Mutex<Vec<Aligned>>,
 }
 
@@ -38,10 +38,10 @@ struct Band<'a> {
     x: &'a [f32],
     photo: &'a Target,
     channel: usize,
-    /// What a photo with alpha lies over.
+    /// Background behind a photo with alpha.
     background: f32,
     rows: Range<usize>,
-    /// What one unit of |x - y| and of SSIM weighs in the loss.
+    /// Weights of one unit of |x - y| and of SSIM in the loss.
     l1: f32,
     ssim: f32,
     scratch: &'a mut Aligned,
@@ -105,7 +105,7 @@ impl<'a, V: bytemuck::Pod> Memory<'a, V> {
             row,
             weights,
         };
-        // Those of a photo that has none.
+        // The weights of a photo without weights.
         let values = memory.row();
         values[..width].fill(1.0);
         memory.put_weights::<S>();
@@ -336,7 +336,7 @@ impl Band<'_> {
             let difference = s.sub_f32s(x, y);
             let distance = s.max_f32s(difference, s.sub_f32s(y, x));
             *sum = s.mul_add_e_f32s(distance, weight, *sum);
-            // The distance has no slope where it is 0.
+            // |x - y| has slope 0 at 0.
             let below = s.less_than_f32s(difference, zero);
             let sign = s.select_f32s(below, minus_l1, zero);
             let sign = s.select_f32s(s.greater_than_f32s(difference, zero), l1, sign);
@@ -346,7 +346,8 @@ impl Band<'_> {
     }
 }
 
-/// `N` vectors of a row of slopes, from `k` on, where one of SSIM weighs `unit`; adds w SSIM to `sum`.
+/// Computes `N` vectors of a row of slopes from vector `k` on; `unit` is the weight of SSIM. Adds w SSIM
+/// to `sum`.
 #[inline(always)]
 fn slopes_of<S: Simd, const N: usize>(
     s: S,
@@ -390,8 +391,7 @@ fn slopes_of<S: Simd, const N: usize>(
     }
 }
 
-/// Rows of the bands of a picture of so many rows, from its size alone, so that no sum depends on
-/// the threads.
+/// Rows per band. Depends only on the picture's height, so that sums do not depend on the threads.
 fn rows_of_bands(height: usize) -> usize {
     let bands = ((height + BAND / 2) / BAND).max(1);
     height.div_ceil(bands).next_multiple_of(STEP)

@@ -67,12 +67,12 @@ pub(super) struct Splats<S: Simd> {
     pub opacity: Lanes<S>,
     /// Derivative of the opacity with respect to the parameter as given.
     pub opacity_slope: Lanes<S>,
-    /// Whether scales and opacity were given as finite numbers. A log-scale of -inf or a logit of
-    /// +inf is poisoned too, though what it stands for is finite.
+    /// Whether scales and opacity were given as finite numbers. A log-scale of -inf or a logit of +inf
+    /// counts as invalid, although its scale or opacity is finite.
     pub given: Mask<S>,
 }
 
-/// The sigmoid of a logit and its derivative, o (1 - o), which keeps its digits where o rounds to 1.
+/// The sigmoid of a logit and its derivative, o (1 - o), which stays accurate when o rounds to 1.
 #[inline(always)]
 pub(super) fn sigmoid<S: Simd>(logit: Lanes<S>) -> (Lanes<S>, Lanes<S>) {
     let (one, e) = (logit.all(1.0), exp(-logit.abs()));
@@ -106,11 +106,10 @@ impl<S: Simd> Splats<S> {
     }
 }
 
-/// What both directions of the stage need of splats.
+/// Quantities of splats that forward and backward share.
 #[derive(Clone, Copy)]
 pub(super) struct Geometry<S: Simd> {
-    /// False where a splat is culled for its own values or its depth; nothing else of it has a
-    /// meaning then.
+    /// False if a splat is culled by its values or its depth; its other fields are then undefined.
     pub drawn: Mask<S>,
     pub t: Vec3s<S>,
     pub inverse_z: Lanes<S>,
@@ -181,7 +180,7 @@ pub(super) struct Ellipses<S: Simd> {
     pub variances: [Lanes<S>; 2],
     /// m0 x m1; its length is the root of the determinant without blur.
     pub area: Vec3s<S>,
-    /// What the opacity is multiplied by; 1 if not antialiased.
+    /// Factor of the opacity; 1 if not antialiased.
     pub compensation: Lanes<S>,
 }
 
@@ -241,16 +240,15 @@ pub(super) struct Splat2d {
     pub depth: f32,
     pub color: [f32; 3],
     pub opacity: f32,
-    /// The square of the distance from its center, in standard deviations, where alpha is
-    /// `ALPHA_MIN`.
+    /// Squared distance from the center, in standard deviations, at which alpha is `ALPHA_MIN`.
     pub reach: f32,
     pub radii: [f32; 2],
 }
 
-/// The stage's room for one block of splats: what is read and what comes out.
+/// Scratch memory for one block of splats: inputs and outputs.
 #[derive(Debug)]
 pub(super) struct ProjectBlock {
-    /// Which splats of the block are projected; what follows has them in this order.
+    /// The projected splats of the block; later arrays are in this order.
     ids: Ids,
     splats: SplatRows,
     /// Camera-space centers.
@@ -260,16 +258,16 @@ pub(super) struct ProjectBlock {
     opacities: Row,
     reach: Row,
     radii: [Row; 2],
-    /// 1 where a splat is visible as far as its shape goes.
+    /// 1 if the splat's shape is visible.
     reaches: Row,
-    /// Places of those, in whose order is what follows: fewer, so that lanes are full.
+    /// Indices of visible splats; later arrays are compacted in this order.
     visible: Ids,
     /// Their numbers in the block.
     numbers: Ids,
     visible_t: [Row; 3],
     coeffs: ColorRows,
     colors: [Row; 3],
-    /// 1 where the color is finite.
+    /// 1 if the color is finite.
     finite: Row,
 }
 
@@ -294,9 +292,8 @@ impl ProjectBlock {
         })
     }
 
-    /// Projects the splats `ids` of the block that begins with splat `first`, with opacities
-    /// multiplied by `compensation`, but for their colors. Returns those that are visible as far as
-    /// their shape goes, by their numbers in the block.
+    /// Projects the shapes of the splats `ids` of the block that begins with splat `first`, with
+    /// opacities multiplied by `compensation`. Returns the ids of those whose shape is visible.
     pub fn shapes(
         &mut self,
         view: &View,
@@ -316,7 +313,7 @@ impl ProjectBlock {
         dispatch(Paint { block: self, view, colors, first });
     }
 
-    /// What came out: the visible splats with their numbers in the block, in order.
+    /// The visible splats with their ids in the block, in order.
     pub fn visible(&self) -> impl Iterator<Item = (usize, Splat2d)> {
         let places = self.visible.get().iter().enumerate();
         places.filter(|&(at, _)| self.finite.0[at] != 0.0).map(|(at, &place)| {
@@ -391,7 +388,7 @@ impl ProjectBlock {
         let ellipses = ellipses(view, splats.scales, &g);
         let (zero, largest) = (Lanes::splat(s, 0.0), Lanes::splat(s, f32::MAX));
         let opacity = splats.opacity * ellipses.compensation;
-        // exp(reach / 2): the logarithm is asked for where it is positive.
+        // exp(reach / 2); its logarithm is used only if positive.
         let contrast = opacity / zero.all(ALPHA_MIN);
         let mut visible = g.drawn & contrast.gt(zero.all(1.0)) & contrast.le(largest);
         let reach = ln(contrast) * 2.0;

@@ -1,8 +1,7 @@
 //! Vector helpers on top of `pulp`, which picks the instruction set at run time.
 //!
-//! Code that runs inside `with_simd` must use plain loops where vectors are touched: a closure, and
-//! so `array::map` or `fold`, is compiled without the instruction set and turns every vector
-//! operation into a call.
+//! Code inside `with_simd` must use plain loops for vector operations: a closure, and so `array::map` or
+//! `fold`, is compiled without the instruction set and turns every vector operation into a call.
 
 use pulp::{Simd, WithSimd};
 
@@ -43,7 +42,7 @@ pub fn instruction_set() -> &'static str {
     }
 }
 
-/// Asks for a value of up to 64 bytes ahead of its use, where Rust has an instruction for it.
+/// Prefetches a value of up to 64 bytes if Rust has an instruction for it.
 #[inline(always)]
 pub(super) fn prefetch<T>(value: &T) {
     #[cfg(target_arch = "x86_64")]
@@ -116,7 +115,7 @@ mod tests {
 
     type Results = (Image<f32>, ProjectedGradients<f32>, Vec<f32>);
 
-    /// What `work` gives at this many lanes.
+    /// Runs `work` with this many lanes.
     fn at<T: Send>(lanes: usize, work: impl FnOnce() -> T + Send) -> T {
         rayon::ThreadPoolBuilder::new()
             .num_threads(2)
@@ -169,8 +168,8 @@ mod tests {
         most / largest
     }
 
-    /// Machines with other vectors than this one's must draw the same: 16 lanes as AVX-512 has, 8 as
-    /// AVX2, 4 as NEON, 1 as where there are none, computed here without their instructions.
+    /// Machines with other vector widths must draw the same: 16 lanes (AVX-512), 8 (AVX2), 4 (NEON) and
+    /// 1, computed here without their instructions.
     #[test]
     fn every_vector_width_draws_the_same() {
         let mut rng = rand_pcg::Pcg64::seed_from_u64(6);
@@ -196,7 +195,7 @@ mod tests {
                 let color =
                     apart(image_n.color.as_flattened().iter(), image.color.iter().flatten());
                 assert!(color < 1e-6, "{what}: picture {color:e}");
-                // Not the same bits: where there are no instructions, multiply-adds round twice.
+                // Not the same bits: without fused instructions, multiply-adds round twice.
                 let t = apart(image_n.transmittance.iter(), image.transmittance.iter());
                 assert!(t < 1e-6, "{what}: transmittance {t:e}");
                 let pairs = [
@@ -215,7 +214,7 @@ mod tests {
         }
     }
 
-    /// 2D splats, gradients of the splats and where a step of Adam takes them.
+    /// 2D splats, gradients of the splats, and parameters after a step of Adam.
     fn per_splat(
         splats: &SplatArrays,
         options: &ProjectOptions,
@@ -292,7 +291,7 @@ mod tests {
                     let moved = |a: &AdamState<f32>, splats: &SplatArrays| -> Vec<f32> {
                         let rows = a.splats.means.as_flattened().iter();
                         let rows = rows.zip(splats.means.as_flattened());
-                        // Only what was no number before may be none.
+                        // A result may be NaN only if the input was.
                         rows.filter(|(_, b)| b.is_finite()).map(|(a, b)| a - b).collect()
                     };
                     let viewmat = |v: &SplatGradients<f32>| -> Vec<f32> {

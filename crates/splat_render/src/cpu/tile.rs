@@ -1,5 +1,5 @@
-//! A tile as the inner loops of rasterize and rasterize_backward see it: how its pixels lie in
-//! memory, what they read of a splat, and which of its vectors a splat reaches.
+//! A tile in the inner loops of rasterize and rasterize_backward: the memory layout of its pixels, the
+//! data of its splats, and the vectors of pixels that a splat reaches.
 
 use std::cell::RefCell;
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
@@ -45,7 +45,7 @@ const fn blocks_across(lanes: usize) -> usize {
     SIDE / block_width(lanes)
 }
 
-/// Where a tile lies in a plane, row-major, of a picture.
+/// Position of a tile in a row-major plane.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Place {
     /// Index of its first pixel.
@@ -114,7 +114,7 @@ impl Pixels {
     }
 }
 
-/// Where the pixel of a tile's row and column lies in [`Pixels`].
+/// Index of a tile's pixel in [`Pixels`].
 #[inline(always)]
 fn offset(row: usize, column: usize, lanes: usize) -> usize {
     let (width, height) = (block_width(lanes), block_height(lanes));
@@ -122,7 +122,7 @@ fn offset(row: usize, column: usize, lanes: usize) -> usize {
     block * lanes + row % height * width + column % width
 }
 
-/// Where a tile's pixels are in the picture.
+/// Pixel centers of a tile.
 #[repr(align(64))]
 pub(super) struct Centers {
     /// x of the pixel centers of each block of a row of blocks.
@@ -197,18 +197,18 @@ impl TileSplat {
     }
 }
 
-/// A bit per vector of a tile, in the order of [`Pixels`]: vector k is bit k % 64 of word k / 64.
-/// More than one word only where there are no vectors of four lanes.
+/// One bit per vector of a tile, in the order of [`Pixels`]: vector k is bit k % 64 of word k / 64. There
+/// is more than one word only for vectors of fewer than four lanes.
 pub(super) type Vectors = [u64; PIXELS / 64];
 
-/// Where the splats of a batch may be seen in a tile: the first half of both rasterize stages. What
-/// depends on no pixel's state is found for the whole batch, in short loops on purpose: no processor
-/// looks far enough ahead to do it while a pixel waits for the splat before.
+/// Pixels of a tile that a batch of splats may reach: the first half of both rasterize stages. Work that
+/// does not depend on a pixel's state is done for the whole batch in short loops, because processors
+/// cannot reorder it ahead while a pixel waits for the previous splat.
 pub(super) struct Reached {
     /// Copies of the splats, since they lie anywhere in memory: asked for together, they are waited
     /// for once.
     pub splats: [TileSplat; BATCH],
-    /// Each splat's vectors end here in what follows.
+    /// Each splat's end in the arrays of vectors.
     pub ends: [usize; BATCH],
     /// Numbers of the vectors that splats may reach and whose pixels have not all stopped.
     pub vectors: [u8; BATCH * PIXELS],
@@ -243,8 +243,8 @@ impl Reached {
         })
     }
 
-    /// Takes the next splats of a tile's list and finds their vectors, of those in `live`; returns
-    /// how many splats there were.
+    /// Takes the next splats of a tile's list and finds their vectors among those in `live`; returns the
+    /// number of splats.
     #[inline(always)]
     pub fn find<S: Simd, const OFFSETS: bool>(
         &mut self,
@@ -258,7 +258,7 @@ impl Reached {
         for (copy, id) in self.splats.iter_mut().zip(ids) {
             *copy = splats[id.load(Relaxed) as usize];
         }
-        // Those of the next batch are on their way while this one is looked at.
+        // Prefetch the next batch.
         for id in ids.iter().skip(BATCH).take(BATCH) {
             prefetch(&splats[id.load(Relaxed) as usize]);
         }
@@ -283,7 +283,7 @@ impl Reached {
         taken
     }
 
-    /// Fills in what the first `count` vectors hold.
+    /// Evaluates the first `count` vectors.
     #[inline(always)]
     fn evaluate<S: Simd, const OFFSETS: bool>(&mut self, s: S, centers: &Centers, count: usize) {
         let across = blocks_across(S::F32_LANES);
@@ -307,7 +307,7 @@ impl Reached {
     }
 }
 
-/// The values of a batch's vectors, one after the other.
+/// The values of a batch's vectors, contiguous.
 #[inline(always)]
 pub(super) fn floats(pixels: &[Pixels; BATCH]) -> &[f32] {
     bytemuck::cast_slice(pixels)

@@ -54,7 +54,7 @@ impl<'a> ColorPlan<'a> {
 /// Room for one block of splats.
 #[derive(Debug)]
 pub(super) struct ColorBlock {
-    /// Splats that wait; what follows has them in this order.
+    /// The splats that wait; later arrays are in this order.
     ids: Ids,
     v_colors: [Row; 3],
     directions: [Row; 3],
@@ -106,7 +106,7 @@ impl ColorBlock {
         }
     }
 
-    /// Gradients of the coefficients of the splats that wait; zeros where a splat has none.
+    /// Gradients of the coefficients of waiting splats; zeros for splats without a gradient.
     #[inline(always)]
     fn expand<S: Simd>(&mut self, s: S, plan: &ColorPlan<'_>, waiting: &[WaitingColor]) {
         let ids = self.ids;
@@ -160,7 +160,7 @@ impl WithSimd for CatchUp<'_, '_> {
         let ids = ids.get();
         let mut at = 0;
         while at < ids.len() {
-            // Neighbors that wait for the same steps go together, where no coefficient rests.
+            // Neighbors that wait for the same steps are updated together if all coefficients are in use.
             let (id, next) = (usize::from(ids[at]), waiting[usize::from(ids[at])].next);
             let mut count = 1;
             while plan.used == plan.stored
@@ -184,7 +184,7 @@ impl WithSimd for CatchUp<'_, '_> {
     }
 }
 
-/// Adam's steps on values and their moments: the first with a gradient, the others without.
+/// Runs Adam's steps on values and their moments: the first with a gradient, the rest without.
 #[inline(always)]
 fn steps<S: Simd>(
     s: S,

@@ -17,7 +17,7 @@ pub enum DensityControl {
     /// Clone, split and prune (Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field
     /// Rendering", 2023).
     Original,
-    /// The splats given stay as many as they are.
+    /// The number of splats stays constant.
     Fixed,
 }
 
@@ -30,12 +30,12 @@ pub enum Background {
     Color([f32; 3]),
 }
 
-/// Settings of a fit. Rates are those of 3DGS unless said otherwise.
+/// Settings of a fit. Rates default to 3DGS's.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FitConfig {
     /// Number of steps of the whole fit; the centers' rate decays over it.
     pub steps: u32,
-    /// The step that moments began at, above 0 where a fit enters the schedule with splats of another.
+    /// The step at which moments start; above 0 if a fit enters the schedule with other splats.
     pub first_step: u32,
     /// Seed of everything random.
     pub seed: u64,
@@ -43,7 +43,7 @@ pub struct FitConfig {
     pub sh_degree: u32,
     /// Steps after which the degree in use grows by one; at most a fifth of all steps.
     pub sh_interval: u32,
-    /// Most splats there may be.
+    /// Maximum number of splats.
     pub max_splats: usize,
     /// How splats are added and removed.
     pub density: DensityControl,
@@ -51,11 +51,10 @@ pub struct FitConfig {
     pub background: Background,
     /// Weight of D-SSIM in the loss.
     pub ssim_weight: f32,
-    /// Adam's rates at the end; that of the centers before `means_decay`, in units of the scene's
-    /// extent.
+    /// Adam's final rates; for the centers the rate before `means_decay`, in units of the scene's extent.
     pub rates: Rates,
-    /// What the first half of the steps multiplies all rates by; the factor then falls to 1, but for
-    /// the centers, whose rate decays by itself. See [`FitConfig::rates_at`].
+    /// Learning-rate multiplier for the first half of the steps; decays to 1, except for the centers,
+    /// whose rate has its own decay. See [`FitConfig::rates_at`].
     pub rate_scale: f32,
     /// Part of the splats that a step leaves out at random, growing from none in the first step to
     /// this in the last (DropGaussian).
@@ -67,10 +66,9 @@ pub struct FitConfig {
     /// Whether the first steps are on photos of a fraction of their size; see
     /// [`FitConfig::reduction`].
     pub coarse_to_fine: bool,
-    /// What the loss of photos' depths is multiplied by in the first step; see
-    /// [`FitConfig::depth_weight_at`].
+    /// Initial weight of the depth loss; see [`FitConfig::depth_weight_at`].
     pub depth_weight: f32,
-    /// What the centers' rate has decayed to at the end, as a part of the start's.
+    /// Final rate of the centers as a fraction of the initial rate.
     pub means_decay: f32,
 }
 
@@ -112,18 +110,18 @@ const MOST_HALVINGS: u32 = 3;
 /// Part of the steps after which photos have their whole size.
 const COARSE_UNTIL: f64 = 0.3;
 
-/// What the weight of photos' depths falls to, as a part of the first step's.
+/// Final weight of the depth loss as a fraction of the initial weight.
 const DEPTH_DECAY: f64 = 0.01;
 
 /// Steps until density control first runs, and from one run to the next, at most.
 const REFINE: (u32, u32) = (300, 100);
 
 impl FitConfig {
-    /// What both sides of photos are divided by in a step, from 0: a power of two, each for as many
-    /// steps as the next, and 1 in the last seven tenths of all steps.
+    /// Factor by which a step (from 0) reduces both sides of photos: a power of two. Each factor lasts
+    /// equally many steps, and the last seven tenths of the steps use 1.
     ///
-    /// A step costs what its pixels and splats cost, and while there are few splats, they show no
-    /// detail of the photos (Chen et al., "DashGaussian", 2025, section 3.2).
+    /// A step's cost grows with pixels and splats, and few splats show no detail of the photos (Chen et
+    /// al., "DashGaussian", 2025, section 3.2).
     ///
     /// `longest` is the longest side of all photos, in pixels.
     pub fn reduction(&self, step: u32, longest: u32) -> u32 {
@@ -136,10 +134,10 @@ impl FitConfig {
         1 << halvings.saturating_sub(done)
     }
 
-    /// Adam's rates in a step, from 0, of a scene of this extent.
+    /// Adam's rates at a step (from 0) for a scene of this extent.
     ///
-    /// 3DGS's rates are for 30 000 steps. In a fit of a tenth of these, splats do not get to where
-    /// they belong: larger steps take them there, and small ones at the end settle them.
+    /// 3DGS's rates are for 30 000 steps. A tenth of these is too short for splats to reach their places:
+    /// large steps take them there, and small steps at the end settle them.
     pub fn rates_at(&self, step: u32, extent: f32) -> Rates {
         let progress = f64::from(step) / f64::from(self.steps);
         let decay = f64::from(self.means_decay).powf(progress) as f32;
@@ -156,10 +154,11 @@ impl FitConfig {
         }
     }
 
-    /// Size of MCMC's noise on centers in a step, from 0, of a scene of this extent; 0 elsewhere.
+    /// Size of MCMC's noise on centers at a step (from 0) for a scene of this extent; 0 for other
+    /// controls.
     ///
-    /// It is in units of 3DGS's rate, not of the rate in use: noise explores, and where centers
-    /// take larger steps, as large noise leaves them beside what they show.
+    /// In units of 3DGS's rate, not of the rate in use: with larger steps, larger noise would leave
+    /// centers off their surfaces.
     pub(super) fn noise_at(&self, step: u32, extent: f32) -> f32 {
         match self.density {
             DensityControl::Mcmc => {
@@ -169,9 +168,9 @@ impl FitConfig {
         }
     }
 
-    /// What the loss of photos' depths is multiplied by in a step, from 0: it falls to a hundredth,
-    /// each step by the same factor. Depths say where to begin, and are less exact than photos
-    /// (Kerbl et al., "A Hierarchical 3D Gaussian Representation", 2024).
+    /// Weight of the depth loss at a step (from 0): decays exponentially to a hundredth. Depths give a
+    /// start, but are less exact than photos (Kerbl et al., "A Hierarchical 3D Gaussian Representation",
+    /// 2024).
     pub fn depth_weight_at(&self, step: u32) -> f32 {
         let progress = f64::from(step) / f64::from(self.steps);
         self.depth_weight * DEPTH_DECAY.powf(progress) as f32
@@ -186,9 +185,8 @@ impl FitConfig {
         (step / interval).min(self.sh_degree)
     }
 
-    /// The step that density control first runs after, and how many lie between two runs: those of
-    /// 3DGS, but short fits are looked at as often as long ones, as long as photos have their turns
-    /// in between.
+    /// First step of density control, and the interval between runs: 3DGS's, but short fits get as many
+    /// runs as long ones if every photo has its turn in between.
     pub fn refine_steps(&self) -> (u32, u32) {
         let (start, every) = REFINE;
         ((self.steps / 10).clamp(start / 4, start), (self.steps / 30).clamp(every / 4, every))

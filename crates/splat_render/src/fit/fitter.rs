@@ -22,14 +22,14 @@ use crate::target::Target;
 
 /// Part of all steps after which density control runs no more (MCMC; original).
 const REFINE_STOP: (f64, f64) = (0.85, 0.5);
-/// Part of all steps after which MCMC has as many splats as there may be.
+/// Fraction of the steps after which MCMC reaches the maximum number of splats.
 const MCMC_GROWN: f64 = 0.5;
 /// Steps between two opacity resets of the original control.
 const RESET_EVERY: u32 = 3000;
 /// MCMC's pull on opacities and scales (the paper's).
 const MCMC_PULL: (f32, f32) = (0.01, 0.01);
 
-/// What a draw is for; part of its seed.
+/// Purpose of a draw; part of its seed.
 #[derive(Clone, Copy)]
 enum Draw {
     Order = 1,
@@ -42,24 +42,23 @@ enum Draw {
 pub struct Fitter {
     device: Box<dyn FitDevice>,
     config: FitConfig,
-    /// The photos at their whole size, until the device has them; what they are divided by there; and
-    /// their longest side.
+    /// The photos at full size until the device has them, the current reduction, and the longest side.
     photos: Vec<Target>,
     reduction: u32,
     longest: u32,
     cameras: Vec<Camera>,
-    /// The cameras, where they are fitted; `cameras` follows them.
+    /// Set if cameras are fitted; `cameras` are their current values.
     moving: Option<Cameras>,
-    /// Exposures of the photos, where they are fitted.
+    /// Set if exposures are fitted.
     exposures: Option<Exposures>,
     has_alpha: Vec<bool>,
-    /// Each photo's own background, where that is known.
+    /// Each photo's background, if known.
     behind: Vec<Option<[f32; 3]>>,
     extent: f32,
     /// How often each photo comes in a round of steps, and the first step that is not of it.
     schedule: Vec<(u32, Option<u32>)>,
-    /// The photos of a round, of those that have not left, each as often as it comes; their order in
-    /// this one; and the step that rounds of these photos began at.
+    /// Active photos with repetitions, their order in this round, and the first step of rounds with these
+    /// photos.
     round: Vec<usize>,
     order: Vec<usize>,
     rounds_from: u32,
@@ -67,8 +66,8 @@ pub struct Fitter {
     step: u32,
 }
 
-/// 1.1 times the largest distance of a camera's center from their mean (3DGS); 1 where all cameras
-/// stand at one place.
+/// 1.1 times the largest distance of a camera's center from the mean center (3DGS); 1 if all centers
+/// coincide.
 pub fn scene_extent(cameras: &[Camera]) -> f64 {
     let mean = cameras.iter().map(Camera::center).sum::<glam::DVec3>() / cameras.len() as f64;
     let radius = cameras.iter().map(|c| (c.center() - mean).length()).fold(0.0, f64::max);
@@ -238,7 +237,7 @@ impl Fitter {
         &self.cameras
     }
 
-    /// What [`Fitter::resume_cameras`] needs, where cameras are fitted.
+    /// The input of [`Fitter::resume_cameras`], if cameras are fitted.
     pub fn camera_state(&mut self) -> Result<Option<CameraState>> {
         self.collect_gradients()?;
         Ok(self.moving.as_ref().map(Cameras::state))
@@ -267,7 +266,7 @@ impl Fitter {
         cameras.set_pose_priors(priors)
     }
 
-    /// Goes on with cameras where another fit's had come to.
+    /// Resumes cameras from another fit's state.
     pub fn resume_cameras(&mut self, state: CameraState) -> Result<()> {
         let Some(cameras) = self.moving.as_mut() else {
             return Err(Error::argument("cameras", "are not fitted here"));
@@ -277,10 +276,11 @@ impl Fitter {
         Ok(())
     }
 
-    /// Sets where the exposures that are fitted start; see [`Exposures::start`]. Before anything else.
+    /// Sets the initial exposures; see [`Exposures::start`]. Call it before any step.
     ///
     /// # Errors
-    /// [`Error::Argument`] if exposures are not fitted, or the starts cannot be used.
+    ///
+    /// [`Error::Argument`] if exposures are not fitted or a value cannot be used.
     pub fn start_exposures(
         &mut self,
         start: &[Option<Exposure<f64>>],
@@ -292,7 +292,7 @@ impl Fitter {
         exposures.start(start, pulls)
     }
 
-    /// Goes on with exposures where another fit's had come to.
+    /// Resumes exposures from another fit's state.
     pub fn resume_exposures(&mut self, state: ExposureState) -> Result<()> {
         let Some(exposures) = self.exposures.as_mut() else {
             return Err(Error::argument("exposures", "are not fitted here"));
@@ -300,14 +300,14 @@ impl Fitter {
         exposures.resume(state)
     }
 
-    /// What [`Fitter::resume_exposures`] needs, where exposures are fitted.
+    /// The input of [`Fitter::resume_exposures`], if exposures are fitted.
     pub fn exposure_state(&mut self) -> Result<Option<ExposureState>> {
         self.collect_gradients()?;
         Ok(self.exposures.as_ref().map(|exposures| exposures.state().clone()))
     }
 
-    /// The photo of step `step` (from 0): every photo takes its turns in a round, in a new order each
-    /// round. When some leave, a round of the others begins.
+    /// The photo of step `step` (from 0). Rounds shuffle the active photos, each repeated by its number
+    /// of turns; when a photo leaves, a new round starts.
     fn view(&mut self, step: u32) -> usize {
         let left =
             self.schedule.iter().filter_map(|&(_, until)| until).filter(|&until| until <= step);
@@ -328,7 +328,7 @@ impl Fitter {
         self.order[(step % n) as usize]
     }
 
-    /// One step, density control included where it is due.
+    /// Does one step, and density control if due.
     pub fn step(&mut self) -> Result<()> {
         self.set_reduction()?;
         let step = self.step;
@@ -345,8 +345,8 @@ impl Fitter {
         let progress = f64::from(step) / f64::from(config.steps);
         let rates = config.rates_at(step, self.extent);
         let mcmc = config.density == DensityControl::Mcmc;
-        // Adam makes its full step of a pull that nothing opposes. Where steps are larger, a splat
-        // that few photos show would fade before one of them comes round again.
+        // Adam takes a full step along an unopposed pull. With larger steps, a splat seen in few photos
+        // would fade before one of them comes round again.
         let faster = rates.opacities / config.rates.opacities.max(f32::MIN_POSITIVE);
         let pull = MCMC_PULL.0 / faster.max(1.0).sqrt();
         let noise_seed = self.rng(Draw::Noise, u64::from(step)).random();

@@ -13,7 +13,7 @@ use crate::error::{Error, Result};
 const RADIUS: usize = 3;
 /// Variance of gray (0..1) that noise has: patches of less have no texture, and score near 0.
 const NOISE: f32 = 1e-4;
-/// A depth's score is the mean of so many best photos: others may not see the place.
+/// A depth's score is the mean over this many best photos, since some may not see the surface.
 const BEST: usize = 2;
 
 /// A photo to sweep, or to compare with.
@@ -27,16 +27,16 @@ pub struct GrayPhoto {
     pub usable: Option<Vec<bool>>,
 }
 
-/// What a sweep finds for a photo.
+/// Result of a sweep.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DepthMap {
     /// `[H * W]` 1 / z-depth with the best score.
     pub inverse_depth: Vec<f32>,
-    /// `[H * W]` correlation in -1..=1; -1 where no other photo sees any of the depths.
+    /// `[H * W]` correlation in -1..=1; -1 if no other photo sees any of the depths.
     pub score: Vec<f32>,
 }
 
-/// What to do for one photo.
+/// A depth map to compute.
 #[derive(Debug, Clone)]
 pub struct Sweep {
     /// Index of the photo.
@@ -156,7 +156,7 @@ impl Best {
         }
     }
 
-    /// Where the parabola through the best score and its neighbors has its top, in planes.
+    /// Position of the maximum of the parabola through the best score and its neighbors, in planes.
     fn between_planes(&self, pixel: usize) -> f32 {
         let (before, score, after) = (self.before[pixel], self.score[pixel], self.after[pixel]);
         let bend = before - 2.0 * score + after;
@@ -170,7 +170,7 @@ impl Best {
 /// Another photo as a photo's camera would see it.
 struct Warped {
     gray: Vec<f32>,
-    /// 1 where the other photo sees the place, else 0.
+    /// 1 if the other photo sees the point, else 0.
     seen: Vec<f32>,
 }
 
@@ -179,7 +179,7 @@ struct Warp<'a> {
     other: &'a GrayPhoto,
     /// Pixel (x, y, 1) of the photo to the other's homogeneous pixel, at infinite depth.
     infinite: DMat3,
-    /// What 1 / depth adds to it.
+    /// Added per unit of 1 / depth.
     epipole: DVec3,
 }
 

@@ -3,7 +3,7 @@
 /// Cells of the bounding box along an axis, along whose curve splats are ordered.
 pub(crate) const CELLS: u32 = 1 << 20;
 
-/// Cells of a bounding box: its low corner and what differences to it are multiplied by.
+/// Cells of a bounding box: its low corner and the scale of offsets from it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Cells {
     pub low: [f32; 3],

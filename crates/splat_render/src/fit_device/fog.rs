@@ -1,11 +1,11 @@
-//! Fog: splats right before a camera, far nearer than all that it shows.
+//! Fog: splats right in front of a camera, far nearer than the surfaces in its picture.
 //!
-//! A large, faint splat there tints one photo and little else. It explains what photos differ by
-//! (exposure, vignetting) and hides what is behind it, which then has no gradients any more. On
-//! plain walls and tables it can outgrow the scene.
+//! A large, faint splat there tints one photo and little else. It explains differences between photos
+//! (exposure, vignetting) and hides the scene behind it, which then gets no gradients. On plain walls and
+//! tables it can outgrow the scene.
 //!
-//! How near a camera's nearest surface is, the host tells from a sample of the splats. Whether a splat is
-//! before it is asked of every splat, in f32 without anything that rounds differently on a GPU.
+//! The host estimates each camera's nearest surface from a sample of the splats. Every splat is compared
+//! with it in f32, without operations that round differently on a GPU.
 
 use bytemuck::{Pod, Zeroable};
 
@@ -16,7 +16,7 @@ use crate::fit_device::exp_accurate;
 const NEAREST: f64 = 0.01;
 /// Fog is nearer than this part of that depth.
 const BEFORE: f32 = 0.5;
-/// Splats whose depths tell the nearest surface, at most, and at least.
+/// Maximum and minimum number of splats sampled for the nearest surface.
 const SAMPLES: (usize, usize) = (10_000, 100);
 /// Standard deviations of its longest axis that a splat reaches to.
 const REACH: f32 = 3.0;
@@ -35,7 +35,7 @@ pub(crate) struct FogCamera {
     pub unused: f32,
 }
 
-/// Every so many splats are sampled.
+/// Stride of the sample.
 pub(crate) fn sampled_every(splats: usize) -> usize {
     splats.div_ceil(SAMPLES.0).max(1)
 }
@@ -130,7 +130,7 @@ mod tests {
             ([0.1, 0.0, 1.0], 0.5),
             ([0.1, 0.0, 2.5], 0.5),  // not far nearer
             ([0.0, 0.0, -1.0], 0.5), // behind the camera
-            ([3.0, 0.0, 1.0], 0.1),  // beside the picture
+            ([3.0, 0.0, 1.0], 0.1),  // outside the picture
             ([3.0, 0.0, 1.0], 1.0),  // reaches into it
         ]);
         assert_eq!(fog(&splats, &[CAMERA]), [400, 404]);

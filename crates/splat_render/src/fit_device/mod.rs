@@ -1,4 +1,4 @@
-//! Where a fit's steps run: the seam between the fitting loop and the backends.
+//! The interface between the fitting loop and the backends.
 
 mod cell_order;
 mod fog;
@@ -53,14 +53,14 @@ pub struct ExposureGradient {
     pub v_offset: [f64; 3],
 }
 
-/// What one step is to do.
+/// Settings of one step.
 #[derive(Debug, Clone, Copy)]
 pub struct StepInput {
     /// Which target.
     pub view: usize,
     /// Its camera, relative to the scene's origin.
     pub camera: Camera,
-    /// Render background, and what a target with alpha is composited over.
+    /// Background of the render and of a photo with alpha.
     pub background: [f32; 3],
     /// SH degree in use.
     pub sh_degree: u32,
@@ -78,26 +78,25 @@ pub struct StepInput {
     /// update: mean += C (z * noise / (1 + exp(-100 (0.005 - opacity)))) with C the splat's 3D
     /// covariance, z from [`noise_normal`] and the parameters as updated.
     pub noise: f32,
-    /// Part of the splats that this step leaves out, those of [`is_dropped`]; the opacities of the
-    /// others are divided by 1 - dropout, so that the picture stays as opaque on the whole.
+    /// Fraction of the splats that this step drops ([`is_dropped`]); the remaining opacities are divided
+    /// by 1 - dropout, which keeps the mean opacity.
     pub dropout: f32,
     /// Seed of noise and dropout; differs from step to step.
     pub noise_seed: u32,
     /// Whether [`FitDevice::camera_gradients`] will ask for this step's.
     pub camera_gradient: bool,
-    /// What the loss of the depth, where the photo has one, is multiplied by; see
-    /// [`Stages::depth_loss`](crate::stages::Stages::depth_loss).
+    /// Weight of [`Stages::depth_loss`](crate::stages::Stages::depth_loss) if the photo has a depth.
     pub depth_weight: f32,
-    /// What the picture is corrected by before the loss; [`FitDevice::exposure_gradients`] then has
-    /// this step's. None compares the picture as it is.
+    /// Exposure correction before the loss, or None. With it, [`FitDevice::exposure_gradients`] includes
+    /// this step's.
     pub exposure: Option<Exposure<f32>>,
 }
 
 impl StepInput {
-    /// Checks what a device is given, against the photos it holds, and returns the step's photo's
-    /// entry: one of `sizes`, `(width, height)` in pixels.
+    /// Checks the settings against the sizes of the device's photos, `(width, height)` in pixels.
     ///
     /// # Errors
+    ///
     /// [`Error::Argument`] that names the field.
     pub fn validate(&self, sizes: impl ExactSizeIterator<Item = (u32, u32)>) -> Result<()> {
         let (count, mut sizes) = (sizes.len(), sizes);
@@ -155,15 +154,16 @@ impl StepInput {
     }
 }
 
-/// A backend that keeps splats, optimizer state and photos where its kernels run.
+/// A backend that keeps splats, optimizer state and photos on its device.
 ///
-/// The loss is `sum_p w_p ((1 - s) mean_c |x - y| + s (1 - mean_c SSIM)) / sum_p w_p` over pixels p
-/// and channels c, with s the SSIM weight, zero padding in the window, plus the loss of the depth,
-/// where the photo has one, and the two regularizers.
-/// Every parameter takes an Adam step in every step, seen or not; colors of splats that are not seen may
-/// take theirs later, with the same bits (on GPUs whose driver fuses multiply-adds alike in both kernels). With [`Rates::ZERO`] nothing moves
-/// ([`AdamStep::is_frozen`]): no parameter, no moment, no noise; the loss, the density statistics and
-/// the cameras' gradients are as ever.
+/// The loss is `sum_p w_p ((1 - s) mean_c |x - y| + s (1 - mean_c SSIM)) / sum_p w_p` over pixels p and
+/// channels c, with s the SSIM weight and zero padding in the window, plus the depth loss if the photo
+/// has a depth, and the two regularizers.
+///
+/// Every parameter takes an Adam step in every step, seen or not. Colors of unseen splats may take theirs
+/// later, with the same bits (on GPUs whose driver fuses multiply-adds alike in both kernels). With
+/// [`Rates::ZERO`] nothing moves ([`AdamStep::is_frozen`]): no parameter, no moment, no noise; the loss,
+/// the density statistics and the cameras' gradients are computed as usual.
 pub trait FitDevice: Send {
     /// Takes the photos, once.
     fn set_targets(&mut self, targets: Vec<Target>) -> Result<()>;
@@ -181,17 +181,17 @@ pub trait FitDevice: Send {
         self.upload(state)
     }
 
-    /// Lets dead splats move to living ones and their number grow (3DGS-MCMC); returns the number of those that move. Bits
-    /// are the same on every device, but for the rounding of whether a splat is fog on GPUs that fuse
-    /// multiplications with additions.
+    /// Moves dead splats to living ones and adds splats (3DGS-MCMC); returns the number of splats that
+    /// are not frozen. Bits are the same on every device, except for the rounding in the fog test on GPUs
+    /// that fuse multiplications with additions.
     fn mcmc(&mut self, run: &McmcRun) -> Result<usize> {
         control_on_host(self, &|state| mcmc(state, run))
     }
 
-    /// Lets splats be cloned, split and pruned by the statistics so far (3DGS), which begin anew; returns
-    /// the number of those that move. Bits are the same on every device, but for the rounding of where
-    /// the halves of a split come to lie on GPUs that fuse multiplications with additions or round
-    /// quotients otherwise.
+    /// Clones, splits and prunes splats by the statistics so far (3DGS), and resets the statistics;
+    /// returns the number of splats that are not frozen. Bits are the same on every device, except for
+    /// the positions of the halves of a split on GPUs that fuse multiplications with additions or round
+    /// quotients differently.
     fn original(&mut self, run: &OriginalRun) -> Result<usize> {
         control_on_host(self, &|state| original(state, run))
     }

@@ -1,5 +1,5 @@
-//! What is random in a step: which splats it leaves out and the exploration noise. Each draw comes
-//! from a seed and a splat's index, the same on every device.
+//! Random numbers of a step: dropped splats and exploration noise. A draw is a hash of a seed and a
+//! splat's index, the same on every device.
 
 /// PCG's output function on one 32-bit word.
 #[inline(always)]

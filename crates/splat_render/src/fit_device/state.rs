@@ -1,9 +1,9 @@
-//! What a device holds of a fit: splats, Adam's moments and what density control watches.
+//! A fit's state on a device: splats, Adam's moments and density statistics.
 
 use crate::error::{Error, Result};
 use crate::splats::SplatArrays;
 
-/// What density control needs to know of each splat since it last ran.
+/// Statistics of each splat since the last density control.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct DensityStats {
     /// `[N]` sum over steps of the length of v_means2d in units of half the image's sides
@@ -31,7 +31,7 @@ pub struct FitState {
     pub second: SplatArrays,
     /// Since density control last ran.
     pub stats: DensityStats,
-    /// So many splats, the last ones, are drawn and never changed.
+    /// Number of splats at the end of the arrays that are drawn and never changed.
     pub frozen: usize,
 }
 

@@ -1,5 +1,5 @@
-//! adam: one optimizer step of all parameters, the exploration noise, and what density control
-//! watches. In fits colors wait ([`super::waiting_colors`]).
+//! adam: one optimizer step of all parameters, the exploration noise, and density statistics. In fits,
+//! colors wait ([`super::waiting_colors`]).
 
 use std::ops::Range;
 
@@ -30,11 +30,11 @@ pub(super) struct AdamBuffers {
     pub second: SplatBuffers,
     /// `[N * NOTES]`
     pub notes: wgpu::Buffer,
-    /// So many splats, the first ones, are moved.
+    /// Number of splats, from the first, that are moved.
     pub moving: u32,
 }
 
-/// What a step of a fit reads besides [`AdamBuffers`].
+/// Input of a fit's step besides [`AdamBuffers`].
 #[derive(Debug)]
 pub(super) struct AdamInput<'a> {
     /// The camera and its 2D splats.
@@ -47,7 +47,7 @@ pub(super) struct AdamInput<'a> {
     pub v_splats2d: &'a wgpu::Buffer,
 }
 
-/// Parameters or moments from what their buffers hold.
+/// Parameters or moments from the bytes of their buffers.
 fn arrays_from_bytes(geometry: &[u8], colors: &[u8], sh_degree: u32) -> SplatArrays {
     let mut out = SplatArrays {
         sh: bytemuck::pod_collect_to_vec(colors),
@@ -65,8 +65,7 @@ fn arrays_from_bytes(geometry: &[u8], colors: &[u8], sh_degree: u32) -> SplatArr
 }
 
 impl AdamBuffers {
-    /// Copies parameters, first and second moments, and statistics to the device, of splats of which
-    /// the first `moving` are moved.
+    /// Copies parameters, moments and statistics to the device; the first `moving` splats are moved.
     pub fn upload(
         gpu: &Gpu,
         [splats, first, second]: [SplatParams<'_, f32>; 3],
@@ -82,7 +81,7 @@ impl AdamBuffers {
         })
     }
 
-    /// Room for so many splats, of which nothing is known yet.
+    /// Uninitialized buffers for `splats` splats.
     pub fn new(gpu: &Gpu, splats: u32, color_floats: u64) -> Result<Self> {
         let arrays = || SplatBuffers::new(gpu, splats, color_floats);
         Ok(Self {
@@ -186,7 +185,7 @@ impl AdamBuffers {
     }
 }
 
-/// What is noted of each splat where its colors are up to date.
+/// The notes of splats whose colors are up to date.
 fn note_rows(stats: &DensityStats) -> Vec<[f32; NOTES]> {
     let row = |(&pull, &seen)| {
         let mut row = [0.0; NOTES];

@@ -20,7 +20,7 @@ pub(super) struct SplatBins {
     splats: u32,
     keys: [wgpu::Buffer; 2],
     order: [wgpu::Buffer; 2],
-    /// Where each rank's pairs begin, and the total.
+    /// Start of each rank's pairs, and the total.
     pub offsets: wgpu::Buffer,
     segment_sums: wgpu::Buffer,
     histogram: wgpu::Buffer,
@@ -38,7 +38,7 @@ pub(super) struct PairBins {
     keys: [wgpu::Buffer; 2],
     slots: [wgpu::Buffer; 2],
     splat_from_slot: wgpu::Buffer,
-    /// Where each tile's pairs begin, where those behind all tiles do, and their number.
+    /// Start of each tile's pairs, the end of all tiles' pairs, and the number of pairs.
     pub tile_begin: wgpu::Buffer,
 }
 
@@ -79,7 +79,7 @@ pub(super) fn tile_count(width: u32, height: u32) -> u32 {
     width.div_ceil(TILE) * height.div_ceil(TILE)
 }
 
-/// Most pairs whose gradient slots of so many floats can be bound at once.
+/// Maximum number of pairs whose gradient slots of `slot_floats` floats can be bound at once.
 pub(super) fn pair_limit(gpu: &Gpu, slot_floats: usize) -> u32 {
     (gpu.binding_limit / (slot_floats as u64 * 4)).min(u64::from(u32::MAX / 2)) as u32
 }
@@ -106,17 +106,17 @@ impl SplatBins {
         })
     }
 
-    /// Bytes of [`Self::status`] for so many chunks.
+    /// Bytes of [`Self::status`] for `chunks` chunks.
     pub fn status_bytes(chunks: u32) -> u64 {
         size_of::<StatusHead>() as u64 + u64::from(chunks.max(1)) * size_of::<ChunkCount>() as u64
     }
 
-    /// Splats by depth; what the sort leaves here, after an even number of passes.
+    /// Splats by depth; the result of the sort after an even number of passes.
     pub fn order(&self) -> &wgpu::Buffer {
         &self.order[0]
     }
 
-    /// Where the depth keys are to be before [`Self::depth_ops`].
+    /// The depth keys, input of [`Self::depth_ops`].
     pub fn keys(&self) -> &wgpu::Buffer {
         &self.keys[0]
     }
@@ -146,7 +146,7 @@ impl SplatBins {
         self.sort_ops(gpu, first, passes, &self.keys, &self.order)
     }
 
-    /// Sorts what [`Self::depth_ops`] has left with all splats by other keys; equal ones keep their order.
+    /// Sorts all splats in the order of [`Self::depth_ops`] by other keys; stable.
     pub fn resort_ops(&self, gpu: &Gpu) -> Vec<Op> {
         let first = SortPass { chunk: ALL_SPLATS, ..SortPass::zeroed() };
         self.sort_ops(gpu, first, u32::BITS / gpu.digit_bits(), &self.keys, &self.order)
@@ -157,8 +157,8 @@ impl SplatBins {
         Groups::Indirect(self.dispatches.clone(), 0)
     }
 
-    /// A dispatch of workgroups of 64 splats of all each, once pairs were counted; of none where they did
-    /// not fit.
+    /// Indirect groups of 64 splats each over all splats once pairs are counted; no groups if the pairs
+    /// do not fit.
     pub fn of_all(&self) -> Groups {
         Groups::Indirect(self.dispatches.clone(), 12)
     }
@@ -335,13 +335,13 @@ impl PairBins {
         })
     }
 
-    /// The splat of each pair in tile order, after a chunk of so many tiles was sorted: in the
-    /// buffer of keys that the sort's last pass has read and nothing needs any more.
+    /// The splat of each pair in tile order after the sort of a chunk of `tiles` tiles, in a buffer of
+    /// keys that is free after the sort's last pass.
     pub fn splat_from_pair(&self, tiles: u32) -> &wgpu::Buffer {
         &self.keys[((sort_passes(tiles, self.digit_bits) + 1) % 2) as usize]
     }
 
-    /// Slots in tile order, after a chunk of so many tiles was sorted.
+    /// Slots in tile order after the sort of a chunk of `tiles` tiles.
     pub fn slot_from_pair(&self, tiles: u32) -> &wgpu::Buffer {
         &self.slots[(sort_passes(tiles, self.digit_bits) % 2) as usize]
     }

@@ -12,7 +12,7 @@ pub(super) fn depth_rows(target: &TargetDepth) -> Vec<[f32; 2]> {
     target.depths.iter().zip(&target.confidences).map(|(&z, &c)| [z, c]).collect()
 }
 
-/// What the kernel reads of a photo, and its sums, for pictures of one size.
+/// Copy of a photo's depths, and sums, for pictures of one size.
 #[derive(Debug)]
 pub(super) struct DepthBuffers {
     /// `[H * W]` depth and confidence.
@@ -21,7 +21,7 @@ pub(super) struct DepthBuffers {
     pub sums: wgpu::Buffer,
 }
 
-/// What the kernel reads and what it changes in place.
+/// Inputs of the kernel and buffers that it updates.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Compared<'a> {
     /// A [`View`].
@@ -42,7 +42,7 @@ impl DepthBuffers {
     /// Bytes of [`Self::sums`].
     pub const SUM_BYTES: u64 = DEPTH_GROUPS as u64 * 4;
 
-    /// For so many pixels.
+    /// Buffers for `pixels` pixels.
     pub fn new(gpu: &Gpu, pixels: u64) -> Result<Self> {
         Ok(Self {
             photo: gpu.bindable("depths of a photo", 8 * pixels)?,
@@ -50,7 +50,7 @@ impl DepthBuffers {
         })
     }
 
-    /// Adds the loss's gradients to those of the picture.
+    /// Adds the loss's gradients to the picture's.
     pub fn op(&self, gpu: &Gpu, of: Compared<'_>) -> Op {
         let bindings = [
             of.view.into(),

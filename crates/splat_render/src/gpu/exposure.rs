@@ -9,7 +9,7 @@ use crate::stages::{Exposure, ExposureGradients, Image};
 /// Sums per workgroup: the gradients of gain and offset.
 const SUMS: usize = 6;
 
-/// What the kernels write, for pictures of one size.
+/// Outputs of the kernels, for pictures of one size.
 #[derive(Debug)]
 pub(super) struct ExposureBuffers {
     /// `[H * W]` corrected color and transmittance.
@@ -18,7 +18,7 @@ pub(super) struct ExposureBuffers {
     pub sums: wgpu::Buffer,
 }
 
-/// What the kernels read and what they change in place.
+/// Inputs of the kernels and buffers that they update.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Exposed<'a> {
     /// A [`View`].
@@ -37,7 +37,7 @@ impl ExposureBuffers {
     /// Bytes of [`Self::sums`].
     pub const SUM_BYTES: u64 = EXPOSURE_GROUPS as u64 * SUMS as u64 * 4;
 
-    /// For so many pixels.
+    /// Buffers for `pixels` pixels.
     pub fn new(gpu: &Gpu, pixels: u64) -> Result<Self> {
         Ok(Self {
             corrected: gpu.bindable("corrected picture", 16 * pixels)?,
@@ -63,7 +63,8 @@ impl ExposureBuffers {
         self.op(gpu, Kernel::Exposure, of)
     }
 
-    /// Turns gradients of the corrected colors into those of the picture, and adds up the others.
+    /// Converts gradients of the corrected colors to the picture's, and sums the gradients of gain and
+    /// offset.
     pub fn backward(&self, gpu: &Gpu, of: Exposed<'_>) -> Op {
         self.op(gpu, Kernel::ExposureBackward, of)
     }

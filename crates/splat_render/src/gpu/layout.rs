@@ -24,10 +24,10 @@ pub(super) const GRADIENT_ABSOLUTE: usize = GRADIENT + 2;
 /// Floats of a camera's gradient: rows of the 3x4 viewmat, fx, fy, cx, cy.
 pub(super) const CAMERA: usize = 16;
 
-/// Words per splat of what a fit notes beside parameters and moments, and where in them lie: the sum of
-/// gradient lengths and the steps seen, as floats, which density control watches; twice the first of the
-/// steps that its colors wait for, and 1 more where that one has a gradient; and that gradient, as
-/// floats, of the color 3 and the direction it was seen along 3.
+/// Words per splat of a fit's notes, with their offsets: the sum of gradient lengths and the number of
+/// steps seen, as floats, for density control; twice the first step that the colors wait for, plus 1 if
+/// that step has a gradient; then that gradient of the color (3 floats) and its viewing direction (3
+/// floats).
 pub(super) const NOTES: usize = 9;
 pub(super) const NOTE_PULL: usize = 0;
 pub(super) const NOTE_SEEN: usize = 1;
@@ -39,10 +39,10 @@ pub(super) const NOTE_DIRECTION: usize = 6;
 /// every per-splat buffer's offset a multiple of 256 bytes.
 pub(super) const SPLATS_PER_GROUP: u32 = 64;
 
-/// Workgroups of the exposure kernels, each with sums of its own.
+/// Workgroups of the exposure kernels; each has separate sums.
 pub(super) const EXPOSURE_GROUPS: u32 = 64;
 
-/// Workgroups of the depth loss, each with a sum of its own.
+/// Workgroups of the depth loss; each has a separate sum.
 pub(super) const DEPTH_GROUPS: u32 = 64;
 
 /// Camera, background and how colors and parameters are stored.
@@ -70,12 +70,12 @@ pub(super) struct View {
 }
 
 impl View {
-    /// What the rasterize stages need.
+    /// The fields that the rasterize stages read.
     pub fn of_picture(width: u32, height: u32, background: [f32; 3]) -> Self {
         Self { background, width, height, tiles_x: width.div_ceil(TILE), ..Self::zeroed() }
     }
 
-    /// What the project stages need for these splats.
+    /// The fields that the project stages read.
     pub fn of_camera(
         camera: &Camera,
         options: &ProjectOptions,
@@ -120,7 +120,7 @@ pub(super) struct Window {
     pub groups_max: u32,
 }
 
-/// The tiles of one dispatch and where their pairs are counted.
+/// The tiles of one dispatch and the index of their counts.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 pub(super) struct Chunk {
@@ -200,7 +200,7 @@ pub(super) struct ChunkCount {
     pub total: u32,
 }
 
-/// What precedes the chunk counts in the status buffer.
+/// Start of the status buffer, before the counts of chunks.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 pub(super) struct StatusHead {
@@ -210,14 +210,14 @@ pub(super) struct StatusHead {
     pub visible: u32,
 }
 
-/// What the depth of a photo counts in a step.
+/// Weight of one depth of the photo in a step.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub(super) struct DepthStep {
     pub scale: f32,
 }
 
-/// What a photo's exposure does to a picture.
+/// A photo's exposure.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub(super) struct ExposureUniform {
@@ -250,7 +250,7 @@ pub(super) struct ColorSteps {
 }
 
 impl ColorSteps {
-    /// Where step `at` lies, and what it holds.
+    /// Offset and value of step `at`.
     pub fn entry(at: usize, step: &ColorStep) -> (u64, [f32; 4]) {
         let offset = std::mem::offset_of!(Self, steps) + 16 * at;
         let [bias_first, bias_second] = step.bias;
@@ -258,7 +258,7 @@ impl ColorSteps {
     }
 }
 
-/// What one step of a fit is to do.
+/// Settings of one step of a fit.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub(super) struct Step {
@@ -282,7 +282,7 @@ pub(super) struct Step {
 }
 
 impl Step {
-    /// What adam is to do to the first `moving` splats.
+    /// An adam step of the first `moving` splats.
     pub fn of_adam(step: &AdamStep, moving: u32) -> Self {
         let n = f64::from(moving.max(1));
         let Rates { means, quats, scales, opacities, sh0, sh_rest } = step.rates;
@@ -306,7 +306,7 @@ impl Step {
         }
     }
 
-    /// The same, with what the loss is told of a photo.
+    /// Adds the settings of the loss.
     pub fn with_loss(self, ssim_weight: f32, weight: Weight, has_weights: bool) -> Self {
         let (ssim, scale) = (f64::from(ssim_weight), weight.scale());
         Self {

@@ -1,9 +1,9 @@
 //! The stages as WGSL kernels on any Vulkan, Metal or DX12 device, through wgpu.
 //!
-//! Nothing here needs subgroups (only llvmpipe uses them: shaders/tile_subgroup.wgsl), more than 16 KiB of
-//! workgroup memory, more than eight storage buffers per kernel, or one workgroup waiting for another;
-//! sums are taken in a fixed order, so that runs repeat bit for bit on a device. What does not fit one
-//! binding is done in parts: splats in windows, tiles in chunks. Neither changes a bit of the result.
+//! Kernels need no subgroups (only llvmpipe uses them: shaders/tile_subgroup.wgsl), at most 16 KiB of
+//! workgroup memory and eight storage buffers, and no workgroup waits for another. Sums are taken in a
+//! fixed order, so that runs repeat bit for bit on a device. Data that exceeds one binding is processed
+//! in parts, with the same bits: splats in windows, tiles in chunks.
 
 mod adam;
 mod bin;

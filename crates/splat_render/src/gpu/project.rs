@@ -22,7 +22,7 @@ pub(super) struct SplatBuffers {
     pub colors: wgpu::Buffer,
 }
 
-/// A camera and the 2D splats it sees, on the device: what all stages after project read.
+/// A camera and its 2D splats on the device, input of all stages after project.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Projection<'a> {
     /// A [`View`].
@@ -36,7 +36,7 @@ pub(super) const SPLAT_2D: usize = size_of::<Splat2d>() / 4;
 
 /// The number of splats as the kernels count them.
 pub(super) fn count(splats: usize) -> Result<u32> {
-    // Far above what fits any device, and low enough that no index overflows.
+    // Above the memory of any device, and low enough that no index overflows.
     u32::try_from(splats).ok().filter(|&n| n < 1 << 26).ok_or_else(|| {
         Error::argument("means", format!("has {splats} rows; backend gpu takes at most 67 million"))
     })
@@ -71,7 +71,7 @@ impl SplatBuffers {
         })
     }
 
-    /// Room for so many splats, of which nothing is known yet.
+    /// Uninitialized buffers for `splats` splats.
     pub fn new(gpu: &Gpu, splats: u32, color_floats: u64) -> Result<Self> {
         let rows = |floats: u64| u64::from(splats) * floats * 4;
         Ok(Self {

@@ -43,7 +43,7 @@ pub(super) struct GradientBuffers {
     pub camera: wgpu::Buffer,
 }
 
-/// Sums of the camera's gradients, for so many splats.
+/// Partial sums of the camera's gradients for `splats` splats.
 pub(super) fn camera_buffer(gpu: &Gpu, splats: u32) -> Result<wgpu::Buffer> {
     gpu.bindable("v_camera", u64::from(camera_sums(splats)) * CAMERA as u64 * 4)
 }

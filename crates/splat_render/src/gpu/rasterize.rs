@@ -10,7 +10,7 @@ use super::project::{Projection, count};
 use crate::error::Result;
 use crate::stages::{Image, Projected};
 
-/// 2D splats as the kernels read them; those that are not drawn are culled.
+/// 2D splats in the kernels' layout; splats that are not drawn become culled ones.
 pub(super) fn splats2d(projected: &Projected<f32>) -> Vec<Splat2d> {
     (0..projected.len())
         .map(|i| {
@@ -31,7 +31,7 @@ pub(super) fn splats2d(projected: &Projected<f32>) -> Vec<Splat2d> {
         .collect()
 }
 
-/// Binned 2D splats: what both directions of the stage begin with.
+/// Binned 2D splats, input of both directions of the stage.
 pub(super) struct Binned {
     pub view: wgpu::Buffer,
     pub splats2d: wgpu::Buffer,
@@ -43,8 +43,8 @@ pub(super) struct Binned {
 }
 
 impl Binned {
-    /// Uploads the splats, sorts them by depth and cuts the tiles into chunks that fit, also with
-    /// so many floats per pair.
+    /// Uploads the splats, sorts them by depth and cuts the tiles into chunks that fit a binding, at
+    /// `floats` floats per pair.
     pub fn new(
         gpu: &Gpu,
         projected: &Projected<f32>,
@@ -90,7 +90,7 @@ pub(super) struct PictureBuffers {
 }
 
 impl PictureBuffers {
-    /// For so many pixels.
+    /// Buffers for `pixels` pixels.
     pub fn new(gpu: &Gpu, pixels: u64) -> Result<Self> {
         Ok(Self {
             picture: gpu.bindable("picture", 16 * pixels)?,

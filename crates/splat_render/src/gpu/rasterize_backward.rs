@@ -9,7 +9,7 @@ use super::rasterize::Binned;
 use crate::error::Result;
 use crate::stages::{Image, ImageGradients, Projected, ProjectedGradients};
 
-/// What the kernels read and write.
+/// Buffers of the kernels.
 #[derive(Debug)]
 pub(super) struct BackwardBuffers {
     /// `[H * W]` gradients of color and accumulated depth.

@@ -16,7 +16,7 @@ pub struct ResidentView<'a> {
     pub camera: &'a Camera,
     /// Settings of the project stage.
     pub options: &'a ProjectOptions,
-    /// Highest SH degree that is evaluated; at most what was given is.
+    /// Highest SH degree to evaluate, capped at the stored one.
     pub sh_degree: u32,
 }
 
@@ -57,7 +57,7 @@ impl ResidentSplats {
         };
         Ok(Self {
             project: project_ops(gpu, drawn, &buffers, bins.keys()),
-            // Whoever draws by the order does not know how many are culled.
+            // Callers that draw in this order cannot know how many splats are culled.
             sort: bins.depth_ops(gpu, true),
             sh_degree,
             sh_stride,
@@ -101,7 +101,7 @@ impl ResidentSplats {
         Projection { view: &self.view, splats2d: &self.splats2d }
     }
 
-    /// What the kernels are told of a view.
+    /// Uniforms of a view.
     pub(super) fn view(&self, view: &ResidentView<'_>) -> View {
         View {
             sh_degree: view.sh_degree.min(self.sh_degree),
@@ -111,7 +111,7 @@ impl ResidentSplats {
         }
     }
 
-    /// [`Self::record`] with what the kernels are told.
+    /// [`Self::record`] with given uniforms.
     pub(super) fn record_view(
         &self,
         gpu: &Gpu,

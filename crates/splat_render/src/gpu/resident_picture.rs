@@ -12,7 +12,7 @@ use super::resident::{ResidentSplats, ResidentView};
 use crate::constants::TILE;
 use crate::error::{Error, Result};
 
-/// A picture on the device, with room for what lies between it and the splats.
+/// A picture on the device, with the buffers of its stages.
 #[derive(Debug)]
 pub struct ResidentPicture {
     width: u32,
@@ -25,7 +25,7 @@ pub struct ResidentPicture {
 }
 
 impl ResidentPicture {
-    /// For pictures of so many pixels or fewer.
+    /// For pictures of at most `width` x `height` pixels.
     pub fn new(gpu: &Gpu, width: u32, height: u32) -> Result<Self> {
         let pixels = u64::from(width) * u64::from(height);
         Ok(Self {
@@ -43,10 +43,10 @@ impl ResidentPicture {
         &self.buffers.picture
     }
 
-    /// Draws the columns of what a camera sees: submits project, sort and a count of the pairs, waits
-    /// for the count, and records to `encoder` what is left to do. The stages project, sort, bin and
-    /// rasterize each have their timestamps, of their last pass; where the pairs of all tiles do not fit
-    /// one binding, rasterize has the bin stages of later parts in it.
+    /// Draws the columns of a camera's picture: submits project, sort and a count of the pairs, waits for
+    /// the count, and records the remaining commands to `encoder`. The stages project, sort, bin and
+    /// rasterize each get the timestamps of their last pass; if the pairs of all tiles exceed one
+    /// binding, rasterize includes the bin stages of later parts.
     pub fn record(
         &mut self,
         gpu: &Gpu,

@@ -1,5 +1,5 @@
-//! Colors that wait (`fit_device::waiting`): a fit's project brings those of splats that it sees up to
-//! date before it evaluates them, and another kernel those of all.
+//! Colors that wait (`fit_device::waiting`): in fits, project updates the colors of visible splats before
+//! it evaluates them, and another kernel updates all.
 
 use std::ops::Range;
 
@@ -11,7 +11,7 @@ use super::layout::{GEOMETRY, NOTES, SPLATS_PER_GROUP};
 use super::project::{Projection, SPLAT_2D, rows, window_uniform};
 
 impl AdamBuffers {
-    /// Projects all splats, those that are seen with colors that are up to date; `steps` is a
+    /// Projects all splats and updates the colors of visible ones; `steps` is a
     /// [`ColorSteps`](super::layout::ColorSteps).
     pub fn project_ops(
         &self,
@@ -23,7 +23,7 @@ impl AdamBuffers {
         self.color_kernel(gpu, Kernel::FitProject, to, bins, steps)
     }
 
-    /// Brings all colors up to date. The SH degree in use is that of the view.
+    /// Brings all colors up to date, in the SH degree of the view.
     pub fn catch_up_ops(
         &self,
         gpu: &Gpu,

@@ -1,6 +1,6 @@
-//! Whether a device computes what it should: all kernels are compiled, and a small scene goes through
-//! every stage there and in the reference. A driver's compiler may refuse a kernel or get it wrong, and
-//! a fit that is wrong from the start shows in no message.
+//! Self-test of a device: compiles all kernels and compares every stage on a small scene with the
+//! reference. A driver's compiler may refuse or miscompile a kernel, and a fit with wrong values fails
+//! silently.
 
 use std::sync::Arc;
 
@@ -20,8 +20,8 @@ use crate::stages::{
 };
 use crate::target::{Target, TargetDepth};
 
-/// Largest difference from the reference, as a part of the largest value: f32 rounds to a hundredth of
-/// it, and a compiler's mistake is no matter of digits.
+/// Maximum difference from the reference, relative to the largest value: a hundred times f32's rounding,
+/// and far below the error of a miscompiled kernel.
 const TOLERANCE: f64 = 1e-3;
 /// Of the scene: one whose decisions are clear (a test has how).
 const SEED: u32 = 97;
@@ -29,14 +29,15 @@ const SPLATS: usize = 40;
 const SIZE: (u32, u32) = (56, 40);
 const BACKGROUND: [f64; 3] = [0.25, 0.5, 0.75];
 
-/// What a stage gives, as plain numbers.
+/// Outputs of a stage as plain numbers.
 type Outputs = Vec<(&'static str, Vec<f64>)>;
 
-/// Compiles every kernel and compares what they compute of a small scene with the reference, and a step
-/// and runs of density control of a fit with the CPU's.
+/// Compiles every kernel and compares the stages on a small scene with the reference, and a step and runs
+/// of density control of a fit with the CPU's.
 ///
 /// # Errors
-/// [`Error::Device`] with what the driver says, or with the first stage that is wrong.
+///
+/// [`Error::Device`] with the driver's message or the name of the first wrong stage.
 pub fn self_test(gpu: &Arc<Gpu>) -> Result<()> {
     gpu.compile_all()?;
     let mut outputs = all_stages::<f32>(&**gpu)?;
@@ -128,8 +129,8 @@ fn photo() -> Target {
     }
 }
 
-/// Depths a third before and behind those of the scene, where its alpha is clearly above or below
-/// what has a depth.
+/// Depths a third before and behind the scene's, at pixels whose alpha is clearly above or below the
+/// threshold of the depth loss.
 fn depths() -> Result<TargetDepth> {
     let options = ProjectOptions { antialiased: true, ..ProjectOptions::default() };
     let projected = Reference.project(&scene::<f64>().params(2), &camera(), &options)?;
@@ -252,8 +253,8 @@ fn a_fit(device: &mut dyn FitDevice) -> Result<Outputs> {
     device.step(&input)?;
     let step = device.download()?;
     let camera = device.camera_gradients()?;
-    // Colors take the first step's update in the second's project. Nothing moves so far that a decision
-    // could differ; the moments tell.
+    // The second step's project applies the first step's color update. Nothing moves far enough to change
+    // a decision; the moments show errors.
     device.upload(begin)?;
     let colors = StepInput { rates: Rates { sh0: 1e-5, sh_rest: 1e-5, ..Rates::ZERO }, ..input };
     device.step(&colors)?;

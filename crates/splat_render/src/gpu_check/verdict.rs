@@ -1,5 +1,5 @@
-//! That a device passed its self-test, remembered from one process to the next: the test costs a second
-//! or more where kernels have not been compiled before. What failed is tried again each time.
+//! Remembers across processes that a device passed its self-test: the test takes a second or more with
+//! uncached kernels. Failures are not remembered.
 
 use std::env;
 use std::hash::{DefaultHasher, Hash, Hasher};
@@ -15,11 +15,12 @@ use crate::io::write_atomically;
 /// Folder of the verdicts; an empty value keeps none.
 const VARIABLE: &str = "IGSR_GPU_CACHE";
 
-/// [`Gpu::new`], with a device that passes [`self_test`] now or, with the same driver and the same
-/// kernels, did before.
+/// [`Gpu::new`], with a device that passes [`self_test`] now or passed it before with the same driver and
+/// kernels.
 ///
 /// # Errors
-/// Those of both.
+///
+/// As [`Gpu::new`] and [`self_test`].
 pub fn open_tested(software_allowed: bool) -> Result<Arc<Gpu>> {
     open_tested_with(software_allowed, &Injected::default())
 }
@@ -27,7 +28,8 @@ pub fn open_tested(software_allowed: bool) -> Result<Arc<Gpu>> {
 /// [`open_tested`] on an adapter with these faults.
 ///
 /// # Errors
-/// Those of [`open_tested`].
+///
+/// As [`open_tested`].
 pub fn open_tested_with(software_allowed: bool, injected: &Injected) -> Result<Arc<Gpu>> {
     let gpu = Arc::new(Gpu::with_faults(software_allowed, injected)?);
     let verdict = verdict_file(&gpu).filter(|_| injected.is_sound());
@@ -54,7 +56,7 @@ fn verdict_file(gpu: &Gpu) -> Option<PathBuf> {
     Some(folder()?.join(format!("{:016x}.passed", key.finish())))
 }
 
-/// Where programs of the system keep what they can make again.
+/// The system's cache folder.
 fn folder() -> Option<PathBuf> {
     if let Some(folder) = env::var_os(VARIABLE) {
         return (!folder.is_empty()).then(|| PathBuf::from(folder));

@@ -20,7 +20,7 @@ impl Named<'_> {
     }
 }
 
-/// What is left of some bytes.
+/// A cursor over bytes.
 #[derive(Clone, Copy)]
 pub struct Bytes<'a> {
     left: &'a [u8],
@@ -38,7 +38,7 @@ impl<'a> Bytes<'a> {
         self.left.len()
     }
 
-    /// The next `count` bytes, which `what` describes.
+    /// The next `count` bytes; `what` describes them in errors.
     pub fn take(&mut self, count: usize, what: &str) -> Result<&'a [u8]> {
         let (taken, left) =
             self.left.split_at_checked(count).ok_or_else(|| self.named.ends_within(what))?;

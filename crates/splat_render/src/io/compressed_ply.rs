@@ -24,7 +24,7 @@ const CHUNK: usize = 256;
 const SH_RANGE: f64 = 8.0;
 /// Highest SH degree of the format.
 const SH_DEGREE: u32 = 3;
-/// Largest magnitude of a log-scale in the bounds: what the format's own writers clamp to.
+/// Maximum magnitude of a log-scale in the bounds, as clamped by the format's own writers.
 const SCALE_MAX: f32 = 20.0;
 
 const ROOM: Room =
@@ -36,7 +36,7 @@ const BOUNDS: [[&str; 6]; 3] = [
     ["min_r", "min_g", "min_b", "max_r", "max_g", "max_b"],
 ];
 
-/// Where in a row of `chunk` the six bounds of one kind are.
+/// Columns of the six bounds of one kind in a row of `chunk`.
 type Columns = [usize; 6];
 
 fn columns<const N: usize>(
@@ -54,7 +54,7 @@ fn columns<const N: usize>(
     Ok(offsets)
 }
 
-/// Reads what follows the header.
+/// Reads the data after the header.
 pub fn read(
     reader: &mut impl BufRead,
     header: &Header,
@@ -142,7 +142,7 @@ pub fn read(
     })
 }
 
-/// The degree of the element `sh`, and where in its rows each `f_rest_k` is.
+/// The degree of the element `sh`, and the column of each `f_rest_k` in its rows.
 fn rest_columns(sh: &Element, count: u64, named: &Named<'_>) -> Result<(u32, Vec<usize>)> {
     if sh.count != count {
         return Err(named.bad(format!(
@@ -200,7 +200,7 @@ fn pack_rotation(quat: [f32; 4]) -> u32 {
 }
 
 fn unpack_sh(byte: u8) -> f32 {
-    // The outermost bytes stand for the ends of the range, the others for the middle of a step.
+    // The outermost bytes decode to the ends of the range, inner bytes to the middle of a step.
     let unit = match byte {
         0 => 0.0,
         255 => 1.0,
@@ -307,7 +307,7 @@ impl Bounds {
         Self { low: fold(f32::INFINITY, f32::min), high: fold(f32::NEG_INFINITY, f32::max) }
     }
 
-    /// Where `row` is between the bounds, 0 to 1; 0 where they coincide.
+    /// Position of `row` between the bounds, 0 to 1; 0 if they coincide.
     fn unit(&self, row: [f32; 3]) -> [f64; 3] {
         std::array::from_fn(|k| {
             let (low, high) = (f64::from(self.low[k]), f64::from(self.high[k]));

@@ -7,16 +7,17 @@ use ::exr::prelude::{FlatSamples, ReadChannels, ReadLayers, read};
 
 use crate::error::{Error, Result};
 
-/// More pixels than this are no photo's depth.
+/// Maximum number of pixels of a depth map.
 const MOST_PIXELS: usize = 1 << 28;
 
-/// Reads channel Z of an EXR file's largest layer, or the only channel where there is no Z.
+/// Reads channel Z of an EXR file's largest layer, or its only channel.
 ///
 /// Returns height, width and `[H * W]` numbers, row-major.
 ///
 /// # Errors
-/// [`Error::File`] if the file cannot be read; [`Error::Argument`] if it is no EXR, is damaged, or
-/// has several channels of which none is Z.
+///
+/// [`Error::File`] if the file cannot be read; [`Error::Argument`] if it is not an EXR file, is damaged,
+/// or has several channels but no Z.
 pub fn read_exr_depth(path: &Path) -> Result<(usize, usize, Vec<f32>)> {
     let bytes = std::fs::read(path).map_err(|e| Error::file(path, e.to_string()))?;
     decode(bytes)

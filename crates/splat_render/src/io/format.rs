@@ -61,8 +61,8 @@ impl Format {
         ENDINGS.iter().find(|(ending, _)| name.ends_with(ending)).map(|(_, format)| *format)
     }
 
-    /// The format of a file that starts with `head`. A compressed .ply counts as .ply here: its
-    /// header tells.
+    /// The format of a file that starts with `head`. A compressed .ply counts as .ply here, since only
+    /// the header shows the difference.
     pub(super) fn of(head: &[u8], named: &Named<'_>) -> Result<Self> {
         let marks: [(&[u8], Self); 7] = [
             (b"ply\n", Self::Ply),
@@ -88,7 +88,7 @@ impl Format {
             _ if head.is_empty() => Err(named.bad("is empty; give a file of splats")),
             (Some(format), _) => Ok(format),
             (None, Some(format @ (Self::Splat | Self::Ksplat))) => Ok(format),
-            // Read on, so that the error says what such a file must start with.
+            // Continue, so that the error names the expected start of the file.
             (None, Some(Self::Ply | Self::CompressedPly)) => Ok(Self::Ply),
             (None, Some(format)) => Err(named.bad(format!(
                 "does not start as a .{} file does; it is damaged or of another kind: give a file \

@@ -18,12 +18,12 @@ const HEADER: usize = 4096;
 const SECTION_HEADER: usize = 1024;
 /// Highest SH degree of the format.
 const SH_DEGREE: u32 = 2;
-/// Half the range of level 2's SH bytes where the header gives none.
+/// Half the range of level 2's SH bytes if the header gives none.
 const SH_HALF_RANGE: f32 = 1.5;
-/// Steps from a bucket's center to its side where the section gives none.
+/// Steps from a bucket's center to its side if the section gives none.
 const POSITION_STEPS: u32 = 32767;
 
-/// Where the parts of a splat are at one compression level.
+/// Layout of a splat at one compression level.
 struct Level {
     scale: usize,
     rotation: usize,
@@ -45,11 +45,11 @@ struct Section<'a> {
     /// Bytes per splat.
     stride: usize,
     rows: &'a [u8],
-    /// Splats per full bucket, and how many buckets are full; the others' sizes follow.
+    /// Splats per full bucket, and the number of full buckets; the sizes of partial buckets follow.
     bucket_size: usize,
     full_buckets: usize,
     partial_sizes: &'a [u8],
-    /// Bytes per bucket, of which the first 12 are its center.
+    /// Bytes per bucket; the first 12 are its center.
     bucket_stride: usize,
     buckets: &'a [u8],
     /// World units per step of a position.

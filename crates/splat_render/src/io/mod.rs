@@ -1,9 +1,9 @@
-//! Files of splats, and of pictures ([`write_exr`]); `docs/guides/formats.md` says what
-//! each format of splats holds.
+//! Files of splats and of pictures ([`write_exr`]); `docs/guides/formats.md` describes each format of
+//! splats.
 //!
-//! Files are untrusted: every size that a file claims is checked against the bytes that are there
-//! before memory is allocated for it, and each error is one message. Files are written whole or not
-//! at all.
+//! Files are untrusted: every size that a file claims is checked against the actual number of bytes
+//! before memory is allocated for it, and each error is one message. Files are written whole or not at
+//! all.
 
 mod atomic;
 mod bytes;
@@ -48,12 +48,13 @@ use ply_header::Header;
 /// The index of a scene in levels of detail, which no one file holds.
 const STREAMED: &str = "lod-meta.json";
 
-/// Reads a file of any format in [`Format`]. The format is detected from the content or, where that
-/// has no signature, from the ending. A file named `meta.json` is that of a SOG in a folder.
+/// Reads a file of any format in [`Format`]. The format is detected from the content or, for formats
+/// without a signature, from the ending. A file named `meta.json` belongs to a SOG in a folder.
 ///
 /// # Errors
-/// [`crate::Error::File`] that names the file: it cannot be opened or read, is damaged, truncated or
-/// of an unknown format.
+///
+/// [`crate::Error::File`] that names the file: it cannot be opened or read, is damaged, truncated or of
+/// an unknown format.
 pub fn read_splats(path: &Path) -> Result<Loaded> {
     let named = Named(path);
     if path.file_name().is_some_and(|name| name == sog::META) {
@@ -79,17 +80,18 @@ pub fn read_splats(path: &Path) -> Result<Loaded> {
     parse(&bytes, format, &named)
 }
 
-/// Reads a file that is in memory, as [`read_splats`] does. `path` is its name in errors, detects
-/// formats without a signature, and locates a `.gltf`'s other files.
+/// Reads a file in memory, as [`read_splats`] does. `path` is its name in errors, detects formats without
+/// a signature, and locates a `.gltf`'s other files.
 ///
 /// # Errors
-/// Those of [`read_splats`].
+///
+/// As [`read_splats`].
 pub fn parse_splats(bytes: &[u8], path: &Path) -> Result<Loaded> {
     let named = Named(path);
     parse(bytes, Format::of(bytes, &named)?, &named)
 }
 
-/// Reads a `.ply` of `size` bytes: what its header says tells INRIA's from a compressed one.
+/// Reads a `.ply` of `size` bytes: the header distinguishes INRIA's from a compressed one.
 fn read_any_ply(reader: &mut impl BufRead, size: u64, named: &Named<'_>) -> Result<Loaded> {
     let header = Header::read(reader, named)?;
     if header.starts_with("chunk") {
@@ -142,7 +144,8 @@ pub fn write_splats(path: &Path, file: &SplatFile) -> Result<Vec<String>> {
 /// Reads a `.ply`, INRIA's or compressed, whatever its ending.
 ///
 /// # Errors
-/// Those of [`read_splats`].
+///
+/// As [`read_splats`].
 pub fn read_ply(path: &Path) -> Result<SplatFile> {
     let named = Named(path);
     let file = open_file(path)?;
@@ -153,7 +156,8 @@ pub fn read_ply(path: &Path) -> Result<SplatFile> {
 /// Writes INRIA's `.ply`, whatever the path's ending.
 ///
 /// # Errors
-/// Those of [`write_splats`].
+///
+/// As [`write_splats`].
 pub fn write_ply(path: &Path, file: &SplatFile) -> Result<()> {
     file.splats.validate()?;
     write_atomically(path, |out| ply::write(out, file))

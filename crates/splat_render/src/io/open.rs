@@ -6,10 +6,11 @@ use std::path::Path;
 use super::bytes::Named;
 use crate::error::Result;
 
-/// Opens a file to read. Pipes, sockets and devices are refused: to open or to read one may take
-/// forever, and what they give has no size that a claim could be held against.
+/// Opens a file for reading. Refuses pipes, sockets and devices: opening or reading one may block
+/// forever, and their content has no size to check a claim against.
 ///
 /// # Errors
+///
 /// [`crate::Error::File`] that names the file.
 pub fn open_file(path: &Path) -> Result<File> {
     let named = Named(path);

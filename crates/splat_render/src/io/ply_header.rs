@@ -73,7 +73,7 @@ impl Element {
     }
 }
 
-/// What the header says.
+/// A parsed header.
 #[derive(Default)]
 pub struct Header {
     /// Tables in the order of the file.
@@ -170,7 +170,7 @@ impl Header {
     }
 }
 
-/// The header's first lines, which hold what .ply has no property for.
+/// The header's first lines, with the data that .ply has no property for.
 pub fn write_comments(out: &mut impl Write, file: &SplatFile) -> std::io::Result<()> {
     writeln!(out, "ply\nformat binary_little_endian 1.0")?;
     if file.origin != [0.0; 3] {

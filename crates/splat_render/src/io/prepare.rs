@@ -1,4 +1,4 @@
-//! What of a scene a format can hold, and the notes about what it cannot.
+//! The part of a scene that a format can hold, and notes about the rest.
 
 use std::borrow::Cow;
 
@@ -8,7 +8,7 @@ use crate::error::Error;
 use crate::sh;
 use crate::splats::SplatArrays;
 
-/// What a format has room for.
+/// Capabilities of a format.
 pub struct Room {
     /// Its name in messages.
     pub name: &'static str,
@@ -79,7 +79,7 @@ pub fn counted(count: usize) -> String {
     format!("{count} splat{}", if count == 1 { "" } else { "s" })
 }
 
-/// Says that values, which `what` names one of, were beyond a format's range, if any were.
+/// Notes that `count` values, such as `what`, were beyond a format's range, if any were.
 pub fn say_clipped(notes: &mut Vec<String>, count: usize, what: &str, range: &str) {
     match count {
         0 => {}

@@ -2,8 +2,8 @@
 
 use crate::sh::C0;
 
-/// Where in its step an opacity byte of 0 or 255 is taken to be, of 255 steps: logits of exactly 0
-/// and 1 would be infinite, and whatever was written lies within half a step of them.
+/// Position within its step of an opacity byte of 0 or 255: logits of exactly 0 and 1 would be infinite,
+/// and the written value lies within half a step of them.
 const OPACITY_END: f64 = 0.25 / 255.0;
 
 /// 1 / (1 + exp(-x)).
@@ -55,8 +55,7 @@ pub fn unit_bits(value: f64, bits: u32) -> u32 {
 pub struct SmallestThree {
     /// Index of the component that is left out, the largest.
     pub largest: usize,
-    /// The others in order, each in [-sqrt(1/2), sqrt(1/2)], of the sign that makes the largest
-    /// positive.
+    /// The rest in order, each in [-sqrt(1/2), sqrt(1/2)], with the sign that makes the largest positive.
     pub others: [f64; 3],
 }
 

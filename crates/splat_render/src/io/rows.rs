@@ -29,7 +29,7 @@ pub struct SplatRows {
 }
 
 enum Source {
-    /// The file, its rows, and where these begin.
+    /// The file, its columns, and the offset of its rows.
     Ply(BufReader<File>, Rows, u64),
     Whole(SplatArrays),
 }
@@ -38,7 +38,8 @@ impl SplatRows {
     /// Opens a file of any format.
     ///
     /// # Errors
-    /// Those of [`read_splats`].
+    ///
+    /// As [`read_splats`].
     pub fn open(path: &Path) -> Result<Self> {
         if let Some(rows) = Self::open_ply(path)? {
             return Ok(rows);

@@ -1,9 +1,9 @@
-//! Niantic's `.spz`: attributes one after the other, compressed.
+//! Niantic's `.spz`: compressed arrays of attributes.
 //!
 //! Versions 2 and 3 are one gzip stream of a 16-byte header and six arrays; version 4 is a 32-byte
-//! header, extensions, a table of sizes, and a zstd stream for each array. Positions are 24-bit
-//! fixed point, rotations three bytes (2) or the smallest three in 32 bits (3, 4). The frame has y
-//! up and z back.
+//! header, extensions, a table of sizes, and a zstd stream for each array. Positions are 24-bit fixed
+//! point, rotations three bytes (2) or the smallest three in 32 bits (3, 4). The frame has y up and z
+//! back.
 
 use std::io::{Read, Write};
 
@@ -32,7 +32,7 @@ const FLAG_ANTIALIASED: u8 = 1;
 const FLAG_EXTENSIONS: u8 = 2;
 /// Most bytes of extensions that are looked through: real ones are a few numbers.
 const EXTENSIONS_MAX: u64 = 1 << 20;
-/// Largest zstd window besides an array's own size: what RFC 8878 asks decoders to support.
+/// Maximum zstd window besides an array's own size; RFC 8878 asks decoders to support it.
 const WINDOW_MAX: u64 = 8 << 20;
 /// Most bits after the point: positions have 24 in all.
 const FRACTION_BITS_MAX: u8 = 24;
@@ -49,7 +49,7 @@ const ROTATION_STEPS: f64 = 511.0;
 const ROOM: Room =
     Room { name: ".spz", sh_degree: SH_DEGREE_MAX, origin: false, antialiased: true };
 
-/// What the headers of all versions say.
+/// The fields of all versions' headers.
 struct Header {
     version: u32,
     count: usize,
@@ -132,7 +132,7 @@ fn open_gzip(bytes: &[u8], named: &Named<'_>) -> Result<(Header, Vec<u8>)> {
     Ok((header, data))
 }
 
-/// Whether `bytes` are records of a type, a length and so many bytes, up to the last byte.
+/// Whether `bytes` are records of a type, a length and that number of bytes, up to the last byte.
 fn records_fill(mut bytes: &[u8]) -> bool {
     while bytes.len() >= 8 {
         let length = u32_at(bytes, 4) as usize;
@@ -254,8 +254,8 @@ fn pack_rotation(wxyz: [f32; 4]) -> u32 {
 
 /// Bits after the point that leave room for the largest coordinate.
 ///
-/// Units are arbitrary here, so positions get all the 24 bits there are, where a fixed number of
-/// fractional bits would suit scenes of one size.
+/// Units are arbitrary, so positions use all 24 bits; a fixed number of fractional bits would suit scenes
+/// of one size.
 fn fraction_bits(splats: &SplatArrays) -> Result<u8> {
     let largest = splats.means.as_flattened().iter().fold(0.0f32, |far, c| far.max(c.abs()));
     let limit = f64::from((1u32 << 23) - 1);

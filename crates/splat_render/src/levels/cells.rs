@@ -2,7 +2,7 @@
 
 /// A part of space.
 pub enum Node {
-    /// What lies below a plane across an axis, and the rest.
+    /// Splits at a plane across an axis: below it and the rest.
     Split { axis: usize, at: f32, halves: [usize; 2] },
     /// A cell, by its number.
     Cell(usize),
@@ -16,7 +16,7 @@ pub struct Cells {
     pub count: usize,
 }
 
-/// Below and above what part of the points a cell's side is measured: a few are far out.
+/// Quantiles between which a cell's side is measured, since a few points are far out.
 const ENDS: [f64; 2] = [0.1, 0.9];
 
 impl Cells {
@@ -71,7 +71,7 @@ fn split(points: &mut [[f32; 3]]) -> Option<(usize, f32, usize)> {
         points.sort_unstable_by(|a, b| a[axis].total_cmp(&b[axis]));
         let plane = points[points.len() / 2][axis];
         let below = points.partition_point(|p| p[axis] < plane);
-        // Where half of them lie on the plane itself, the next larger number is as good.
+        // If half of them lie on the plane, use the next larger number.
         let (plane, below) = match below {
             0 => {
                 let below = points.partition_point(|p| p[axis] <= plane);

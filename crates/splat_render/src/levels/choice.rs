@@ -1,5 +1,5 @@
-//! Which level of each cell to draw: the coarsest of all, then finer where it is seen most, until a budget
-//! of splats is spent or nothing more could be seen.
+//! Chooses the level of each cell to draw: starts from the coarsest and refines the most visible cells
+//! until a budget of splats is spent or a finer level would not be visible.
 
 use std::cmp::Ordering;
 use std::collections::BinaryHeap;
@@ -14,7 +14,7 @@ const UNSEEN_PART: usize = 4;
 /// A box and its splats, which reach out of it, are taken for a ball this much larger.
 const REACH: f64 = 1.5;
 
-/// From where a scene is looked at.
+/// A camera's view for the choice.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct View {
     /// The camera, in the world.
@@ -114,7 +114,7 @@ pub fn choose(manifest: &Manifest, view: &View, budget: usize) -> Choice {
     out
 }
 
-/// All cells as coarse as there are, as many as the budget has room for.
+/// All cells at their coarsest level, as many as the budget permits.
 pub fn coarsest(manifest: &Manifest, budget: usize) -> Choice {
     let cells = &manifest.cells;
     let mut out = Choice { levels: vec![None; cells.len()], order: Vec::new(), held: 0 };
@@ -138,7 +138,7 @@ fn count(cell: &Cell, level: usize) -> usize {
     cell.runs[level].map_or(0, |run| run.count)
 }
 
-/// What a cell at a level costs: the coarsest is held beside it.
+/// Splats in memory for a cell at a level; the coarsest level stays loaded too.
 fn held(cell: &Cell, level: usize) -> usize {
     let coarsest = cell.runs.iter().rposition(Option::is_some).filter(|&c| c != level);
     count(cell, level) + coarsest.map_or(0, |c| count(cell, c))

@@ -1,9 +1,9 @@
-//! `lod-meta.json`: which cells there are, and where the splats of their levels lie.
+//! `lod-meta.json`: the cells, and the files of their levels.
 //!
 //! The layout is PlayCanvas's, version 1
-//! (<https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/streamed-sog/>). Its tree of
-//! two halves each is read as a list of its leaves, the cells. `origin` is our own field, which others pass
-//! over.
+//! (<https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/streamed-sog/>). Its binary
+//! tree is read as a list of its leaves, the cells. `origin` is igsr's own field, which other readers
+//! ignore.
 
 use std::io::Read;
 use std::path::{Component, Path, PathBuf};
@@ -45,7 +45,7 @@ pub struct Cell {
     pub errors: Vec<f64>,
 }
 
-/// What the file says.
+/// The content of the file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Manifest {
     /// Its folder.
@@ -58,15 +58,16 @@ pub struct Manifest {
     pub origin: [f64; 3],
     /// Leaves of the tree.
     pub cells: Vec<Cell>,
-    /// A SOG of what is drawn always, such as a sky.
+    /// A SOG that is always drawn, such as a sky.
     pub environment: Option<PathBuf>,
 }
 
 impl Manifest {
-    /// Reads the file, or that of a folder.
+    /// Reads the file, or the one in a folder.
     ///
     /// # Errors
-    /// [`Error::File`] that names the file: it cannot be read, or what it says is no such scene.
+    ///
+    /// [`Error::File`] that names the file: it cannot be read, or is not a valid index.
     pub fn read(path: &Path) -> Result<Self> {
         let file = if path.is_dir() { path.join(INDEX) } else { path.to_owned() };
         let bad = |what: String| Error::file(&file, format!("{what}; write the levels again"));

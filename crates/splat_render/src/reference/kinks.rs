@@ -9,8 +9,8 @@ use crate::camera::Camera;
 use crate::constants::TRANSMITTANCE_MIN;
 use crate::stages::{Colors, ProjectOptions, Projected, SplatParams};
 
-/// Hash of every decision: culling, Jacobian limits, color's cut at zero, depth order, pairs that
-/// contribute, alphas that are capped, where each pixel stops.
+/// Hash of every decision: culling, Jacobian limits, the color's clamp at zero, depth order, pairs that
+/// contribute, capped alphas, and early stops of pixels.
 pub fn decisions(
     splats: &SplatParams<'_, f64>,
     camera: &Camera,

@@ -47,7 +47,7 @@ pub(super) fn loss(
         for c in 0..3 {
             let (x, y) = (image.color[pixel][c], photo[pixel][c]);
             out.value += scale * w * (1.0 - s) * (x - y).abs();
-            // The distance has no slope where it is 0.
+            // |x - y| has slope 0 at 0.
             let sign = if x == y { 0.0 } else { (x - y).signum() };
             out.v_color[pixel][c] += scale * w * (1.0 - s) * sign;
 

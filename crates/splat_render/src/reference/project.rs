@@ -7,7 +7,7 @@ use crate::constants::{ALPHA_MIN, QUAT_NORM2_MIN};
 use crate::sh;
 use crate::stages::{Colors, ProjectOptions, Projected, SplatParams};
 
-/// What both directions of the stage need of one splat.
+/// Quantities of one splat that forward and backward share.
 pub(super) struct Geometry {
     /// Camera-space center.
     pub t: DVec3,
@@ -30,7 +30,7 @@ pub(super) struct Geometry {
     pub m: [DVec3; 2],
     /// Upper-triangular factor of the conic.
     pub factor: [f64; 3],
-    /// What the opacity is multiplied by; 1 if not antialiased.
+    /// Factor of the opacity; 1 if not antialiased.
     pub compensation: f64,
 }
 
@@ -60,7 +60,7 @@ pub(super) fn geometry(
     let quat_norm = norm2.sqrt();
     let quat = [w / quat_norm, x / quat_norm, y / quat_norm, z / quat_norm];
     let axes = DMat3::from_quat(DQuat::from_xyzw(quat[1], quat[2], quat[3], quat[0]));
-    // A logit of +inf or a log-scale of -inf is poisoned, though what it stands for is finite.
+    // A logit of +inf or a log-scale of -inf counts as invalid, although its opacity or scale is finite.
     if !splats.opacities[i].is_finite() {
         return None;
     }

@@ -130,7 +130,7 @@ pub(super) fn project_backward(
         let v_row_z = -v_a[0] * (fx * g.xz / z) - v_a[1] * (fy * g.yz / z);
         v_rotation += DMat3::from_cols(v_row_x, v_row_y, v_row_z).transpose();
 
-        // J, with x/z and y/z held where they are limited.
+        // J, with clamped x/z and y/z held constant.
         v_fx += v_j00 / z - v_j02 * g.xz / z;
         v_fy += v_j11 / z - v_j12 * g.yz / z;
         v_t.z += -v_j00 * fx / (z * z) + v_j02 * fx * g.xz / (z * z) - v_j11 * fy / (z * z)

@@ -1,20 +1,18 @@
-//! What a photo's exposure and white balance make of a rendered picture.
+//! Exposure and white balance of a photo, applied to a rendered picture.
 
 use num_traits::Float;
 
 use crate::error::{Error, Result};
 
-/// Gain and offset per channel of one photo. In a photo without alpha a picture's colors become
-/// `gain * color + offset`. In one with alpha the camera saw what is before the background alone:
-/// with T the picture's transmittance and b its background, colors become
-/// `gain * (color - T b) + offset * (1 - T) + T b`.
+/// Gain and offset per channel of one photo. For a photo without alpha, colors become `gain * color +
+/// offset`. In a photo with alpha, only the foreground was exposed: with T the picture's transmittance
+/// and b its background, colors become `gain * (color - T b) + offset * (1 - T) + T b`.
 ///
-/// What comes out is cut to 0..=1, which is all that a photo holds: where a photo is white, a color
-/// may be any that is white in it. Back goes what brings a color that was cut closer to what a photo
-/// holds, and nothing that takes it further away.
+/// The result is clamped to 0..=1, the range of photos: white pixels of a photo match any brighter color.
+/// Gradients pass if they move a clamped color back toward the range, and are dropped if they would move
+/// it further out.
 ///
-/// Colors are encoded as photos are (sRGB), 1 at the brightest: one stop is a gain of about
-/// 2^(1/2.2).
+/// Colors are encoded as in photos (sRGB), 1 at the brightest: one stop is a gain of about 2^(1/2.2).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Exposure<T> {
     /// Factor of R, G and B.

@@ -22,7 +22,7 @@ pub struct CameraConfig {
     pub focal: Focal,
     /// Adam's rate at the start, in pixels that a step moves the picture by.
     pub rate: f32,
-    /// What the rate has decayed to at the end of the fit, as a part of the start's.
+    /// Final rate as a fraction of the initial rate.
     pub decay: f32,
     /// Part of the fit's steps in which cameras rest: the splats need a shape first.
     pub warm_up: f32,

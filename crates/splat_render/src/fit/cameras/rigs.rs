@@ -23,7 +23,7 @@ pub(super) struct Rigs {
 }
 
 impl Rigs {
-    /// Every camera by itself.
+    /// Every camera is a rig alone.
     pub(super) fn none(count: usize) -> Self {
         Self { first: (0..count).collect(), turn: vec![DMat3::IDENTITY; count] }
     }
@@ -107,7 +107,7 @@ impl Rigs {
         left_turned(&self.turn[k], &matrices[self.first[k]])
     }
 
-    /// A symmetric one, both sides of which are.
+    /// A symmetric matrix, transformed on both sides.
     pub(super) fn form_at(&self, k: usize, matrices: &[PoseMatrix]) -> PoseMatrix {
         turned(&self.turn[k], &matrices[self.first[k]])
     }

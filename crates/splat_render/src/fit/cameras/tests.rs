@@ -1,4 +1,4 @@
-//! Cameras that are pulled to where points should be seen.
+//! Cameras that are pulled to the positions at which points should appear.
 
 use glam::{DMat3, DMat4, DQuat, DVec3};
 
@@ -42,7 +42,7 @@ fn config() -> CameraConfig {
     }
 }
 
-/// What a standard deviation in pixels along every way of moving leaves of information.
+/// A prior with the same standard deviation in pixels along every direction.
 fn known(camera: &Camera, sigma: f64) -> PosePrior {
     let mut pose = [[0.0; POSE]; POSE];
     for (i, row) in pose.iter_mut().enumerate() {
@@ -62,7 +62,7 @@ const POINTS: [[f64; 3]; 6] = [
     [-0.4, -0.5, -0.6],
 ];
 
-/// Gradient of half the squared distances between where two cameras see the points.
+/// Gradient of half the squared distances between the points in two cameras' pictures.
 fn gradient(view: usize, camera: &Camera, truth: &Camera) -> CameraGradient {
     let mut out = CameraGradient { view, ..CameraGradient::default() };
     for point in POINTS {

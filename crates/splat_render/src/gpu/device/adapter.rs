@@ -56,12 +56,13 @@ fn adapters(instance: &wgpu::Instance) -> Vec<wgpu::Adapter> {
 }
 
 impl Gpu {
-    /// Opens the best adapter: a real GPU where there is one, else, if `software_allowed`, a
-    /// software one such as lavapipe. Kernels compile when they are first used;
-    /// `gpu_check` compiles and tries them.
+    /// Opens the best adapter: a real GPU if there is one, else, if `software_allowed`, a software
+    /// adapter such as lavapipe. Kernels compile when they are first used; `gpu_check` compiles and tests
+    /// them.
     ///
     /// # Errors
-    /// [`Error::NoAdapter`] if none answers, [`Error::Device`] if the one that does fails.
+    ///
+    /// [`Error::NoAdapter`] if none answers, [`Error::Device`] if it fails.
     pub fn new(software_allowed: bool) -> Result<Self> {
         Self::with_faults(software_allowed, &Injected::default())
     }
@@ -91,14 +92,14 @@ impl Gpu {
         Self::open(adapter, injected)
     }
 
-    /// Opens the best adapter that can show pictures in a window, a software one where there is no
-    /// other, and the window's surface on it.
+    /// Opens the best adapter that can draw in a window, if necessary a software one, and the window's
+    /// surface on it.
     pub fn for_window(
         window: impl Into<wgpu::SurfaceTarget<'static>>,
     ) -> Result<(Self, wgpu::Adapter, wgpu::Surface<'static>)> {
         let instance = instance();
         let mut adapters = adapters(&instance);
-        // Without a driver there is no surface either, and wgpu's error for that names nothing.
+        // Without a driver there is no surface, and wgpu's error message does not name the cause.
         if !adapters.is_empty() {
             let surface = instance
                 .create_surface(window)
@@ -124,7 +125,7 @@ impl Gpu {
         check_limits(&info.name, &offered)?;
         let software = info.device_type == wgpu::DeviceType::Cpu;
         let [real, sharing, plain] = Build::ALL;
-        // Subgroups only where they were measured to pay.
+        // Use subgroups only on adapters for which they were measured to be faster.
         let threads = sharing.threads();
         let shares = adapter.features().contains(wgpu::Features::SUBGROUP)
             && (info.subgroup_min_size, info.subgroup_max_size) == (threads, threads);
@@ -133,7 +134,7 @@ impl Gpu {
             (true, true) => sharing,
             (true, false) => plain,
         };
-        // What the kernels do not need may be lower than WebGPU's defaults. Scenes profit from large
+        // Accept limits below WebGPU's defaults if the kernels do not need them. Scenes profit from large
         // buffers.
         let required_limits = wgpu::Limits {
             max_storage_buffer_binding_size: offered.max_storage_buffer_binding_size,
@@ -145,7 +146,7 @@ impl Gpu {
         let (device, queue) = ready(adapter.request_device(&wgpu::DeviceDescriptor {
             label: Some("splat_render"),
             required_limits,
-            // Who draws frames wants to know what they cost.
+            // For callers that time frames.
             required_features: adapter.features() & wgpu::Features::TIMESTAMP_QUERY
                 | if build.subgroups { wgpu::Features::SUBGROUP } else { wgpu::Features::empty() },
             memory_hints: wgpu::MemoryHints::Performance,

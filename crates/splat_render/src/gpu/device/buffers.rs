@@ -6,8 +6,8 @@ use super::commands::Op;
 use super::{Gpu, note};
 use crate::error::Result;
 
-/// What new buffers hold in builds with debug assertions: 1.5e9 as a float, far out as an index. A
-/// NaN would not show in gradients, which are set to zero where they are not finite.
+/// Contents of new buffers in builds with debug assertions: 1.5e9 as a float, out of range as an index. A
+/// NaN would not show in gradients, which are set to zero if not finite.
 #[cfg(debug_assertions)]
 const POISON: u32 = 0x4ead_beef;
 
@@ -35,7 +35,7 @@ impl Gpu {
             mapped_at_creation: cfg!(debug_assertions),
         });
         self.count(size);
-        // wgpu hands out zeros, which would hide a read of what no kernel has written.
+        // wgpu clears buffers, which would hide reads of memory that no kernel has written.
         #[cfg(debug_assertions)]
         {
             if let Ok(mut view) = buffer.get_mapped_range_mut(..) {
@@ -65,8 +65,7 @@ impl Gpu {
         self.buffer(label, bytes)
     }
 
-    /// Room for what a pixel keeps between dispatches that walk a part of its tile's list each;
-    /// empty where one walks all.
+    /// Per-pixel state between dispatches that each walk a part of a tile's list; empty if one walks all.
     pub(in crate::gpu) fn transmittances(&self, pixels: u64) -> Result<wgpu::Buffer> {
         let floats = if self.list_limit == u32::MAX { 0 } else { pixels };
         self.bindable("transmittances", 4 * floats)

@@ -33,7 +33,7 @@ impl<'a> Bound<'a> {
 /// How many workgroups a dispatch has.
 #[derive(Debug, Clone)]
 pub(in crate::gpu) enum Groups {
-    /// So many, known when it is prepared.
+    /// Known when the dispatch is prepared.
     Direct([u32; 2]),
     /// As three numbers at an offset in a buffer say, bytes.
     Indirect(wgpu::Buffer, u64),
@@ -57,7 +57,8 @@ pub(in crate::gpu) enum Op {
     },
     /// Fills a buffer with zeros.
     Clear(wgpu::Buffer),
-    /// Copies so many bytes (the last) from the start of the first buffer to an offset in the second.
+    /// Copies this many bytes (the last field) from the start of the first buffer to an offset in the
+    /// second.
     Copy(wgpu::Buffer, wgpu::Buffer, u64, u64),
 }
 
@@ -97,7 +98,8 @@ impl Gpu {
     /// Compiles every kernel, several at once.
     ///
     /// # Errors
-    /// [`crate::Error::Device`] with what the driver says of the first that it refuses.
+    ///
+    /// [`crate::Error::Device`] with the driver's message for the first kernel that it refuses.
     pub fn compile_all(&self) -> Result<()> {
         Kernel::ALL.par_iter().for_each(|&kernel| {
             self.pipeline(kernel);

@@ -1,9 +1,8 @@
-//! What an adapter must have, and the message for one that has not.
+//! Required limits of an adapter, and the error message for too low ones.
 
 use crate::error::{Error, Result};
 
-/// What the kernels ask of an adapter; a test holds it against them. All of it is within WebGPU's
-/// default limits.
+/// Limits that the kernels need, all within WebGPU's defaults. A test compares them with the kernels.
 pub fn needed_limits() -> wgpu::Limits {
     wgpu::Limits {
         max_storage_buffers_per_shader_stage: 8,

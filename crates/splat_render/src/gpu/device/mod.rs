@@ -1,5 +1,5 @@
-//! The device: what is known of it, and wgpu's errors as this crate's. It is opened in `adapter.rs`,
-//! makes buffers in `buffers.rs` and runs kernels in `commands.rs`.
+//! The device and its errors. `adapter.rs` opens it, `buffers.rs` makes buffers, and `commands.rs` runs
+//! kernels.
 
 mod adapter;
 mod buffers;
@@ -32,9 +32,9 @@ pub struct Gpu {
     failure: Arc<Mutex<Option<String>>>,
     /// Why the device was lost, after which nothing works on it.
     lost: Arc<OnceLock<String>>,
-    /// What tests make it do.
+    /// Faults injected by tests.
     injected: Injected,
-    /// Submissions until one fails, that one included; 0 where none will.
+    /// Number of submissions until one fails, including it; 0 if none will.
     submissions_left: AtomicU64,
     /// Whether work is only planned: buffers take no memory and nothing runs.
     plans_only: bool,
@@ -46,7 +46,7 @@ pub struct Gpu {
     pub(super) binding_limit: u64,
     /// Most workgroups in one dimension of a dispatch.
     pub(super) groups_max: u32,
-    /// What the shaders are built for.
+    /// Build parameters of the shaders.
     build: Build,
     /// Pairs of a tile that one dispatch of the rasterize kernels walks.
     pub(super) list_limit: u32,
@@ -134,7 +134,7 @@ impl Gpu {
         format!("{} ({:?}, {})", self.info.name, self.info.backend, self.info.driver_info)
     }
 
-    /// What wgpu knows of the adapter and its driver.
+    /// The adapter and its driver, as wgpu reports them.
     pub fn info(&self) -> &wgpu::AdapterInfo {
         &self.info
     }
@@ -169,14 +169,14 @@ impl Gpu {
         self.lost.get().is_some()
     }
 
-    /// Loses the device as a driver that is reset does, for tests of what becomes of its callers.
+    /// Loses the device as a driver reset does, for tests.
     pub fn lose(&self) {
         self.device.destroy();
         // The callback is called from here, once nothing is under way.
         let _ = self.device.poll(wgpu::PollType::wait_indefinitely());
     }
 
-    /// Lets a submission fail, once: the next one at 1. For tests of what becomes of its callers.
+    /// Makes one submission fail, the next one at 1, for tests.
     pub fn fail_submission(&self, number: u64) {
         self.submissions_left.store(number, Ordering::Relaxed);
     }
@@ -233,7 +233,8 @@ impl Gpu {
         })
     }
 
-    /// What wgpu reported since the last call; always an error once the device is lost.
+    /// Returns the first error that wgpu reported since the last call; always an error once the device is
+    /// lost.
     pub fn check(&self) -> Result<()> {
         let failure = self.failure.lock().ok().and_then(|mut f| f.take());
         if self.is_lost() {
@@ -250,7 +251,7 @@ fn one_line(text: &str) -> String {
 
 fn note(failure: &Mutex<Option<String>>, what: String) {
     if let Ok(mut failure) = failure.lock() {
-        // The first failure is the cause, what follows its consequences.
+        // Later failures are consequences of the first.
         failure.get_or_insert_with(|| one_line(&what));
     }
 }

@@ -13,7 +13,7 @@ macro_rules! kernels {
         }
 
         impl Kernel {
-            /// All kernels; those of one source follow each other.
+            /// All kernels; kernels of one source are adjacent.
             pub const ALL: &[Self] = &[$(Self::$kernel),*];
 
             pub fn source(self) -> &'static Source {

@@ -71,7 +71,7 @@ fn density_bounds(
 }
 
 fn cell(point: f32, low: f32, scale: f32) -> u32 {
-    // `upper` is 0 or 1, so that what is given to rounded is 0.
+    // `upper` is 0 or 1, so the second argument of rounded is 0.
     let place = rounded(point - low, cells.upper >> 1u) * scale;
     if !is_finite(place) {
         return 0u;

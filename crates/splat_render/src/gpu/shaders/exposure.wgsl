@@ -3,7 +3,7 @@
 // thread adds up pixels that lie a stride apart, a workgroup its threads in order, the host the groups.
 // Follows shared.wgsl.
 
-// Fourth components are unused but for that of background: 1 where a photo with alpha keeps it.
+// Fourth components are unused except background's: 1 if the photo has alpha and keeps its background.
 struct Exposure {
     gain: vec4<f32>,
     offset: vec4<f32>,
@@ -30,7 +30,7 @@ const SUMS = 6u;
 
 var<workgroup> partial_sums: array<f32, 384>; // SUMS THREADS
 
-// A pixel before it is cut to what a photo holds.
+// A corrected pixel before the clamp.
 fn raw(pixel: vec4<f32>) -> vec3<f32> {
     return exposed.gain.xyz * pixel.xyz + exposed.offset.xyz + pixel.w * exposed.behind.xyz;
 }
@@ -59,13 +59,13 @@ fn exposure_backward(
         let pixel = picture[i];
         let before = raw(pixel);
         let gradient = v_picture[i].xyz;
-        // What takes a cut color further away from what a photo holds stays behind.
-        // Brackets, or "<" and ">" of one expression open and close a template list.
+        // Gradients that would move a clamped color further out are dropped. Brackets, because "<" and
+        // ">" in one expression open and close a template list.
         let over = (before > vec3(1.0)) & (gradient < vec3(0.0));
         let under = (before < vec3(0.0)) & (gradient > vec3(0.0));
         let leaves = over | under;
         let v = select(gradient, vec3(0.0), leaves);
-        // What of the pixel the exposure leaves as it is.
+        // The part of the pixel that the exposure does not change.
         let kept = pixel.w * exposed.background.w;
         v_gain += v * (pixel.xyz - kept * exposed.background.xyz);
         v_offset += v * (1.0 - kept);

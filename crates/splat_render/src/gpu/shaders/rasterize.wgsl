@@ -7,8 +7,8 @@
 @group(0) @binding(2) var<storage, read> splats2d: array<Splat2d>;
 @group(0) @binding(3) var<storage, read> tile_begin: array<u32>;
 @group(0) @binding(4) var<storage, read> splat_from_pair: array<u32>;
-// Color over the background and final transmittance, row-major. Where a tile's list goes on in the
-// next dispatch: color so far and transmittance, negative where the pixel has stopped.
+// Color over the background and final transmittance, row-major. If a tile's list continues in the next
+// dispatch: color so far and transmittance, negative once the pixel has stopped.
 @group(0) @binding(5) var<storage, read_write> picture: array<vec4<f32>>;
 @group(0) @binding(6) var<storage, read_write> depths: array<f32>;
 
@@ -25,7 +25,7 @@ struct Quad {
     depth: vec4<f32>,
 }
 
-// What the dispatch before left of a pixel: `picture`, and the depth.
+// A pixel's state after the previous dispatch: `picture`, and the depth.
 struct Kept {
     pixel: vec4<f32>,
     depth: f32,

@@ -1,5 +1,5 @@
-// How the threads of a tile share its splats, on any device: each reads every splat from storage
-// (staging them in workgroup memory was slower). tile_subgroup.wgsl is the other way.
+// Sharing a tile's splats among its threads, on any device: each thread reads every splat from storage
+// (staging them in workgroup memory was slower). tile_subgroup.wgsl is the alternative.
 
 // Pairs that are read at once.
 const AHEAD = 1u;

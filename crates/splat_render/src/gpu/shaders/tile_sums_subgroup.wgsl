@@ -1,5 +1,5 @@
-// Sums over the threads of a tile where they are one subgroup: thread b keeps those of a batch's
-// splat b and writes them.
+// Sums over the threads of a tile that are one subgroup: thread b keeps and writes the sums of a batch's
+// splat b.
 
 const BATCH = AHEAD;
 

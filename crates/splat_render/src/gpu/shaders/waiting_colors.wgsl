@@ -5,11 +5,11 @@
 
 // The steps that colors may wait for.
 struct ColorSteps {
-    // So many there are; the step at hand is not among them.
+    // Number of steps, without the current one.
     count: u32,
-    // So many splats, the first ones, have colors that move.
+    // Number of splats, from the first, whose colors move.
     moving: u32,
-    // Rates of the first coefficient and of the others, bias corrections of both moments.
+    // Rates of the first coefficient and the rest, bias corrections of both moments.
     steps: array<vec4<f32>, COLOR_WAIT>,
 }
 

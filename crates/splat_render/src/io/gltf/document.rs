@@ -50,7 +50,7 @@ impl<'a> Document<'a> {
         Ok(document)
     }
 
-    /// Bytes of all buffers: what counts of splats are held against.
+    /// Bytes of all buffers, to check counts of splats against.
     pub fn size(&self) -> usize {
         self.stores.iter().map(|store| store.len()).sum()
     }
@@ -147,7 +147,7 @@ impl<'a> Document<'a> {
     }
 }
 
-/// At most so many values are in a JSON text: each but the first follows a mark outside strings.
+/// Upper bound on the number of values in a JSON text: each but the first follows a mark outside strings.
 fn values(text: &[u8]) -> usize {
     let (mut count, mut quoted, mut escaped) = (1, false, false);
     for byte in text {

@@ -22,7 +22,7 @@ const SH_DEGREE: u32 = 3;
 /// The only kernel that splats here have.
 const KERNEL: &str = "ellipse";
 const COLOR_SPACE: &str = "srgb_rec709_display";
-/// Where igsr keeps the antialiased flag, for which the extension has no place.
+/// Name of igsr's antialiased flag, which the extension does not define.
 const ANTIALIASED: &str = "antialiased";
 
 /// `component type` of 32-bit floats.

@@ -1,4 +1,4 @@
-//! Where the nodes of a glTF scene put its meshes.
+//! Transforms of a glTF scene's meshes by its nodes.
 
 use glam::{DMat3, DMat4, DQuat, DVec3};
 use serde_json::Value;
@@ -27,7 +27,7 @@ pub fn placed_meshes(document: &Document<'_>) -> Result<Vec<Placed>> {
     let scene = number(&document.json, "scene").unwrap_or(0);
     let roots = match document.list("scenes").get(scene) {
         Some(scene) => indices(scene, "nodes"),
-        // A file may do without scenes; then all nodes that are nobody's child are shown.
+        // Without scenes, all root nodes are shown.
         None => {
             let nodes = document.list("nodes");
             let children: std::collections::HashSet<usize> =

@@ -1,4 +1,4 @@
-//! `meta.json`: what the images are called and how their bytes count.
+//! `meta.json`: the names of the images and the scales of their bytes.
 
 use serde_json::{Value, json};
 
@@ -14,7 +14,7 @@ pub struct Meta {
     pub antialiased: bool,
     /// Bounds of the positions' signed logarithms.
     pub low: [f64; 3],
-    /// The other bound.
+    /// The upper bound.
     pub high: [f64; 3],
     /// Images of the positions' low and high bytes.
     pub means: [String; 2],

@@ -17,7 +17,7 @@ pub fn parse(bytes: &[u8], named: &Named<'_>) -> Result<Loaded> {
     unpack(&meta, &mut bundle, bytes.len(), named)
 }
 
-/// Reads a `meta.json` and the images beside it.
+/// Reads a `meta.json` and the images next to it.
 pub fn parse_folder(named: &Named<'_>) -> Result<Loaded> {
     let mut bundle = Bundle::beside(named);
     let meta = Meta::read(&bundle.meta()?, named)?;
@@ -99,7 +99,7 @@ fn unpack_rest(
                 rest.count
             )));
         }
-        // Rows of the image hold PALETTE_COLUMNS entries one after the other, as memory does.
+        // Rows of the image hold PALETTE_COLUMNS consecutive entries, as in memory.
         let row = &palette.rgba[label * each..][..each];
         for (k, [r, g, b, _]) in row.iter().enumerate() {
             splats.sh[i * stride + 1 + k] =

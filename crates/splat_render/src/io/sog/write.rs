@@ -156,7 +156,7 @@ fn signed_ln(x: f32) -> f64 {
     x.signum() * x.abs().ln_1p()
 }
 
-/// Bounds of the positions' signed logarithms; zero where there are no splats.
+/// Bounds of the positions' signed logarithms; zero without splats.
 fn bounds(splats: &SplatArrays) -> ([f64; 3], [f64; 3]) {
     let fold = |start: f64, pick: fn(f64, f64) -> f64| {
         std::array::from_fn(|k| {
