@@ -1,4 +1,4 @@
-//! Photos to fit to, with what each counts in the loss.
+//! Photos to fit, and the weights of their pixels.
 
 use crate::error::{Error, Result};
 
@@ -16,28 +16,27 @@ pub struct Target {
     /// `[H * W]` weight of each pixel in the loss, or None for 1 everywhere. The loss is a mean over
     /// the pixels whose weight is not 0: a photo of small weights counts less than others.
     pub weights: Option<Vec<f32>>,
-    /// Depths of its pixels, where they are known.
+    /// Depths of its pixels, if known.
     pub depth: Option<TargetDepth>,
-    /// RGB in 0..=1 of the background in a photo without alpha, where it is known: renders are
-    /// compared over it.
+    /// RGB in 0..=1 of the known background in a photo without alpha: renders are composited over it.
     pub background: Option<[f32; 3]>,
     /// How many steps of a round are of it, at least 1.
     pub turns: u32,
-    /// The first step that is not of it any more, where there is one.
+    /// The first step without the photo, or None.
     pub until: Option<u32>,
 }
 
-/// How far away what a photo shows is, as a sensor or a network found it.
+/// Depths of a photo's pixels, from a sensor or a network.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TargetDepth {
-    /// `[H * W]` camera-space z, world units, above 0 where its confidence is.
+    /// `[H * W]` camera-space z, world units; above 0 if its confidence is.
     pub depths: Vec<f32>,
-    /// `[H * W]` confidence of each, in 0..=1; 0 where the depth is not known.
+    /// `[H * W]` confidence in 0..=1; 0 if the depth is unknown.
     pub confidences: Vec<f32>,
 }
 
 impl TargetDepth {
-    /// Checks sizes and values; what is wrong follows the name of the photo.
+    /// Checks sizes and values; the error continues the photo's name.
     pub(crate) fn validate(&self, pixels: usize) -> std::result::Result<(), &'static str> {
         if self.depths.len() != pixels || self.confidences.len() != pixels {
             return Err("has depths that are not of the image's size");
@@ -52,14 +51,14 @@ impl TargetDepth {
         Ok(())
     }
 
-    /// What a pixel of confidence 1 counts in the loss, a mean; 0 where no depth is known.
+    /// Weight of a pixel of confidence 1 in the loss, which is a mean; 0 without known depths.
     pub(crate) fn scale(&self) -> f64 {
         let count = self.confidences.iter().filter(|c| **c > 0.0).count();
         if count > 0 { 1.0 / count as f64 } else { 0.0 }
     }
 }
 
-/// What a photo's pixels weigh.
+/// Sum and number of a photo's weights.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Weight {
     /// Sum of the weights.
@@ -77,8 +76,8 @@ impl Weight {
         }
     }
 
-    /// What one channel of a pixel of weight 1 counts in the loss, a mean; 0 where the photo is
-    /// masked out everywhere and asks for nothing.
+    /// Weight of one channel of a pixel of weight 1 in the loss, which is a mean; 0 if the photo is
+    /// masked out everywhere.
     pub(crate) fn scale(&self) -> f64 {
         if self.count > 0.0 { 1.0 / (3.0 * self.count) } else { 0.0 }
     }
@@ -133,10 +132,10 @@ impl Target {
         self.weights.as_deref().map_or(Weight { sum: pixels, count: pixels }, Weight::of)
     }
 
-    /// The photo with each `by` x `by` pixels averaged into one; rows and columns left over are dropped.
+    /// The photo with each `by` x `by` pixels averaged into one; leftover rows and columns are dropped.
     ///
-    /// Colors are weighted by alpha and by the weights, which are averaged themselves. The depth is
-    /// that of a pixel in the middle: a mean over an edge is on no surface.
+    /// Colors are weighted by alpha and by the weights, which are averaged too. The depth is taken from a
+    /// pixel in the middle: a mean over an edge is on no surface.
     pub fn reduced(&self, by: u32) -> Self {
         let (width, height) = (self.width / by, self.height / by);
         let (side, channels) = (by as usize, self.channels as usize);
@@ -247,7 +246,7 @@ mod tests {
         pixels[12..16].copy_from_slice(&[40, 100, 50, 255]);
         let weights = vec![1.0, 1.0, 0.0, 1.0, 0.0, 0.0];
         let clear = photo(4, pixels, Some(weights)).reduced(2);
-        // Neither the transparent pixel's color counts nor that of the one of weight 0.
+        // The transparent pixel and the one of weight 0 do not contribute colors.
         assert_eq!(clear.pixels, [20, 100, 50, 170]);
         assert_eq!(clear.weights, Some(vec![0.75]));
         clear.validate(0).unwrap();

@@ -8,7 +8,7 @@ use splat_render::{Error, Result};
 
 use crate::display::Drawing;
 
-/// What `--help` prints.
+/// Text of `--help`.
 pub const HELP: &str = "\
 Show Gaussian splats in a window, or draw pictures of them.
 
@@ -45,7 +45,7 @@ View:
 
   --help, --version";
 
-/// What computes the pictures without a window.
+/// Backend that renders without a window.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Backend {
     /// A real GPU if one answers, else the CPU.
@@ -69,13 +69,13 @@ pub struct Arguments {
     pub time: Option<u32>,
     /// Width and height in pixels.
     pub size: Option<[u32; 2]>,
-    /// What computes.
+    /// Backend of the rasterizer.
     pub backend: Backend,
-    /// What draws in the window.
+    /// Renderer in the window.
     pub drawing: Drawing,
     /// File or folder of the capture's cameras.
     pub cameras: Option<PathBuf>,
-    /// Most splats of a scene in levels of detail.
+    /// Maximum number of splats of a scene in levels of detail.
     pub budget: Option<usize>,
     /// Number of the camera to start at.
     pub camera: Option<usize>,
@@ -91,7 +91,7 @@ pub struct Arguments {
     pub background: Option<[f32; 3]>,
 }
 
-/// What the command line asks for.
+/// A parsed command line.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Asked {
     /// Print [`HELP`].

@@ -32,7 +32,7 @@ impl CameraPath {
         }
     }
 
-    /// The view `t` places after the first; None if there are no places.
+    /// The view at parameter `t`; t = k is place k. None without places.
     pub fn at(&self, t: f64) -> Option<Viewpoint> {
         let last = self.keys.len().checked_sub(1)?;
         let segment = (t.max(0.0) as usize).min(last.saturating_sub(1));

@@ -14,7 +14,7 @@ pub struct Look {
     pub background: [f32; 3],
     /// First pixel column of the second canvas.
     pub divider: f32,
-    /// 1 where the canvases hold depths.
+    /// 1 if the canvases hold depths.
     pub is_depth: u32,
     /// Depths at the ends of the color map, in the canvases' unit.
     pub depth_range: [f32; 2],

@@ -28,10 +28,10 @@ impl Display {
     ];
 }
 
-/// What draws splats as they are rendered; the other displays are the blending unit's.
+/// Renderer of the display `Splats`; blending draws the remaining displays.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Drawing {
-    /// The rasterizer on software adapters, where it is the faster one, else the blending unit.
+    /// The rasterizer on software adapters, for which it is faster, else blending.
     #[default]
     Auto,
     /// splat_render's rasterizer.
@@ -49,9 +49,9 @@ impl Drawing {
 /// How a picture is drawn.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Settings {
-    /// What is shown.
+    /// The display.
     pub display: Display,
-    /// What draws it.
+    /// The renderer.
     pub drawing: Drawing,
     /// Highest SH degree that is evaluated.
     pub sh_degree: u32,

@@ -202,7 +202,7 @@ mod tests {
             let mut viewer = Viewer::new(Settings::default(), String::new());
             viewer.viewpoint = Viewpoint::framing(glam::DVec3::ZERO, 1.0, viewer.up, 1.0);
             let mut hand = Self { context: Context::default(), viewer, time: 0.0 };
-            // egui knows what lies under the pointer from the frame before.
+            // egui hit-tests against the previous frame.
             hand.frame(Vec::new());
             hand
         }
@@ -233,7 +233,7 @@ mod tests {
             actions
         }
 
-        /// Fingers as egui-winit tells of them: the first is a mouse, too. One after the other comes down.
+        /// Finger events as egui-winit sends them, one after another: the first finger is a mouse, too.
         fn fingers(&mut self, phase: TouchPhase, places: &[Pos2]) {
             if phase == TouchPhase::Start && places.len() > 1 {
                 self.fingers(phase, &places[..1]);
@@ -260,7 +260,7 @@ mod tests {
         }
     }
 
-    /// Where a point of the world is in the picture.
+    /// Pixel of a point of the world.
     fn seen(viewpoint: &Viewpoint, point: glam::DVec3) -> [f64; 2] {
         let camera = viewpoint.camera(SIZE, Settings::default().fov);
         let p = camera.viewmat.transform_point3(point);

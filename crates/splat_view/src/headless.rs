@@ -25,9 +25,9 @@ use crate::viewpoint::{Viewpoint, fitted, relative_to};
 /// Default size of pictures.
 const SIZE: [u32; 2] = [1280, 720];
 
-/// What the pictures are of.
+/// The scene to draw.
 struct Scene {
-    /// Its splats are those for the camera of the last picture, where it is in levels of detail.
+    /// If in levels of detail, holds the splats for the last picture's camera.
     model: Model,
     camera: Camera,
     viewpoint: Viewpoint,
@@ -35,7 +35,7 @@ struct Scene {
     up: glam::DVec3,
 }
 
-/// Does what the command line asks for without a window.
+/// Runs a command line without a window.
 pub fn run(arguments: &Arguments) -> Result<()> {
     let mut scene = Scene::new(arguments)?;
     if let Some(frames) = arguments.time {
@@ -65,7 +65,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     Ok(())
 }
 
-/// Makes a folder for pictures; one that holds anything is refused: those of two turns would mix.
+/// Makes a folder for pictures. A folder with files is refused, so that two turntables do not mix.
 fn make_empty(folder: &Path) -> Result<()> {
     let unwritable = |e| Error::file(folder, format!("cannot be made ({e}); name another"));
     std::fs::create_dir_all(folder).map_err(unwritable)?;
@@ -126,11 +126,11 @@ impl Scene {
         Ok(Self { model, camera, viewpoint, settings, up })
     }
 
-    /// Reads what a camera needs of a scene in levels of detail, and says how much that is.
+    /// Reads a camera's splats of a scene in levels of detail, and reports their number.
     fn look(&mut self, camera: &Camera) -> Result<()> {
         let Some(detail) = &mut self.model.detail else { return Ok(()) };
         let choice = detail.choose(&view(camera, self.settings.near));
-        // The copy of the last picture would be held beside what is read.
+        // Free the last picture's copy before reading.
         self.model.file = SplatFile::default();
         while let Some(loaded) = detail.load_next(&choice) {
             loaded?;
@@ -230,7 +230,7 @@ fn time(scene: &Scene, frames: u32) -> Result<()> {
             println!("{name:>12} {:9.2}", median(took));
         }
     }
-    // Submission, and what the timestamps leave out.
+    // Submission and other time outside the timestamps.
     let rest = whole.iter().zip(&stages).map(|(whole, times)| whole - times.iter().sum::<f32>());
     println!("{:>12} {:9.2}", "rest", median(rest.collect()));
     let least = whole.iter().copied().fold(f32::INFINITY, f32::min);

@@ -28,7 +28,7 @@ pub struct Loader {
     receiver: Receiver<Loaded>,
     /// The file that each side waits for.
     waits: [Option<PathBuf>; 2],
-    /// Most splats of a scene in levels of detail.
+    /// Maximum number of splats of a scene in levels of detail.
     budget: Option<usize>,
 }
 
@@ -51,13 +51,13 @@ impl Loader {
         std::thread::spawn(move || {
             let stamp = stamp(&path);
             let model = Model::read(&path, budget);
-            // Nobody receives once the window is closed.
+            // The receiver is gone once the window is closed.
             let _ = sender.send(Loaded { side, path, stamp, model });
             wake();
         });
     }
 
-    /// Drops what is being read for a side: it will not be shown.
+    /// Drops the pending read for a side: it will not be shown.
     pub fn forget(&mut self, side: usize) {
         self.waits[side] = None;
     }

@@ -21,19 +21,20 @@ pub struct Model {
     pub file: SplatFile,
     /// Center of the visible splats, in world coordinates.
     pub center: DVec3,
-    /// Radius about the center: of 90% of the visible splats, at most four times that of 50%.
+    /// Radius about the center that holds 90 % of the visible splats, at most four times the radius for
+    /// 50 %.
     pub radius: f64,
-    /// What was ignored in reading, one message each.
+    /// Messages about ignored content.
     pub notes: Vec<String>,
-    /// Where more of it lies: `file` is the part of a scene in levels of detail that is drawn.
+    /// For a scene in levels of detail; `file` is then its drawn part.
     pub detail: Option<Detail>,
-    /// Splats that the whole scene has, if that is not what `file` has.
+    /// Number of splats of the whole scene, if `file` has another.
     pub whole: Option<usize>,
 }
 
 impl Model {
-    /// Reads a splat file, a checkpoint of a fit, or a scene in levels of detail, of which no more splats
-    /// than a budget are held.
+    /// Reads a splat file, a checkpoint of a fit, or a scene in levels of detail with at most `budget`
+    /// splats.
     pub fn read(path: &Path, budget: Option<usize>) -> Result<Self> {
         if is_in_levels(path) {
             let (detail, file) = Detail::open(path, budget.unwrap_or(BUDGET))?;

@@ -1,4 +1,4 @@
-//! What the window tells, newest last. A note does not replace another: both can be read.
+//! Messages in the window, newest last. A note does not replace another: both can be read.
 
 use std::time::{Duration, Instant};
 
@@ -12,7 +12,7 @@ const STAYS: Duration = Duration::from_secs(60);
 struct Note {
     text: String,
     since: Instant,
-    /// Whether it says where the view stands, and so goes once that changes.
+    /// Whether it describes the current view; the next such note replaces it.
     is_state: bool,
 }
 
@@ -21,12 +21,12 @@ struct Note {
 pub struct Notes(Vec<Note>);
 
 impl Notes {
-    /// Tells something: a result, a warning or an error. Empty texts tell nothing.
+    /// Shows a result, a warning or an error. Empty texts are ignored.
     pub fn tell(&mut self, text: impl Into<String>) {
         self.push(text.into(), false, Instant::now());
     }
 
-    /// Tells where the view stands now, in place of where it stood before.
+    /// Shows the state of the view in place of the previous state.
     pub fn tell_state(&mut self, text: impl Into<String>) {
         self.0.retain(|note| !note.is_state);
         self.push(text.into(), true, Instant::now());

@@ -1,4 +1,4 @@
-//! What is painted over the splats: the capture's cameras, a photo, the divider.
+//! Painted over the splats: the capture's cameras, a photo, the divider.
 
 use egui::{Align2, Color32, FontId, Pos2, Rect, Stroke, TextureHandle, Ui};
 use glam::DVec3;
@@ -89,10 +89,10 @@ pub fn photo(viewer: &Viewer, ui: &Ui, size: [u32; 2], texture: &TextureHandle) 
     ui.painter().image(texture.id(), rect, whole, tint);
 }
 
-/// Moves the divider between two models while the pointer holds it; returns whether it does.
+/// Moves the divider between two models during a drag; returns whether it is dragged.
 ///
-/// The place where the button went down decides. egui itself takes the pointer's place at the end of
-/// the frame, which on a slow device is past the divider already.
+/// The press position decides. egui uses the position at the end of the frame, which on a slow device is
+/// past the divider already.
 pub fn hold_divider(viewer: &mut Viewer, ui: &Ui) -> bool {
     if !viewer.compares() {
         viewer.holds_divider = false;

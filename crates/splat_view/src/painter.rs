@@ -41,7 +41,7 @@ pub fn check_size(gpu: &Gpu, [width, height]: [u32; 2]) -> Result<()> {
     ))
 }
 
-/// What a frame shows.
+/// The content of a frame.
 #[derive(Debug, Clone, Copy)]
 pub struct Shot<'a> {
     /// The camera, with the size of the picture.
@@ -50,9 +50,9 @@ pub struct Shot<'a> {
     pub settings: &'a Settings,
     /// The model; the left one if there are two.
     pub left: Option<&'a Drawable>,
-    /// The other, on the right.
+    /// The right model.
     pub right: Option<&'a Drawable>,
-    /// Where the right one begins, as a fraction of the width.
+    /// Start of the right model, as a fraction of the width.
     pub divider: f32,
     /// Depths at the ends of the color map, world units.
     pub depths: [f32; 2],
@@ -112,7 +112,7 @@ impl Painter {
         Ok(written)
     }
 
-    /// Where egui's pass writes its timestamps.
+    /// Timestamps of egui's pass.
     pub fn panel_stamps(&self) -> Option<wgpu::RenderPassTimestampWrites<'_>> {
         self.times.stamps(PANEL).render(0)
     }
@@ -146,7 +146,7 @@ impl Painter {
         Ok(rows.flat_map(|row| row[..4 * width as usize].iter().copied()).collect())
     }
 
-    /// Expected depth at a pixel in world units; None where nothing is.
+    /// Expected depth at a pixel in world units; None for empty pixels.
     pub fn depth_at(&mut self, shot: &Shot<'_>, pixel: [u32; 2]) -> Result<Option<f64>> {
         let settings = Settings { display: Display::Depth, ..*shot.settings };
         let shot = Shot { settings: &settings, ..*shot };
@@ -162,7 +162,7 @@ impl Painter {
         let data = self.gpu.read(&[(&readable, 8)])?;
         let texel: [u16; 4] = bytemuck::pod_read_unaligned(&data[0]);
         let [depth, .., alpha] = texel.map(|bits| f16::from_bits(bits).to_f64());
-        // Where less than half is opaque, nothing can be made out.
+        // Pixels that are less than half opaque count as empty.
         Ok((alpha > 0.5).then(|| depth / alpha * f64::from(unit(&shot))))
     }
 

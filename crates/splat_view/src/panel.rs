@@ -1,4 +1,4 @@
-//! The panel beside the scene: settings, cameras, files, statistics.
+//! The side panel: settings, cameras, files, statistics.
 
 use egui::{ComboBox, Panel, ScrollArea, Slider, SliderClamping, Ui};
 use glam::DVec3;
@@ -55,7 +55,7 @@ pub fn panel(
     });
 }
 
-/// Notes at the panel's foot, where no list pushes them out of sight.
+/// Notes at the panel's foot, so that lists do not push them out of sight.
 fn notes(viewer: &Viewer, ui: &mut Ui) {
     if viewer.notes.texts().next().is_none() {
         return;
@@ -256,7 +256,7 @@ mod tests {
     use crate::painter::Painter;
     use crate::viewer::Shown;
 
-    /// The settings after two frames in which nobody touches the panel.
+    /// The settings after two frames without input on the panel.
     fn untouched(mut viewer: Viewer) -> Settings {
         let context = Context::default();
         for _ in 0..2 {

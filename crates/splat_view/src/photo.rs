@@ -178,7 +178,7 @@ mod tests {
         let small = photo.within(3);
         assert_eq!(small.size, [3, 1]);
         assert_eq!(small.rgba, [5, 105, 50, 255, 25, 105, 50, 255, 45, 105, 50, 255]);
-        // Thinner than what stays of it, and seen through.
+        // Thinner than the reduced size, and partly transparent.
         let line = Photo { size: [4, 1], rgba: [[9, 9, 9, 255], [77, 0, 0, 0]].concat().repeat(2) };
         let line = line.within(2);
         assert_eq!((line.size, line.rgba), ([2, 1], [9, 9, 9, 128].repeat(2)));

@@ -1,4 +1,4 @@
-//! What the window saves: screenshots, EXR files, and the pictures of a camera path.
+//! Files saved from the window: screenshots, EXR files, and the pictures of a camera path.
 
 use std::path::{Path, PathBuf};
 

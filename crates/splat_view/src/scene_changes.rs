@@ -14,7 +14,7 @@ use crate::streaming::Streaming;
 use crate::viewer::Shown;
 
 impl Session {
-    /// Shows what was read before the window opened, from where the command line says.
+    /// Shows the scene that was read before the window opened, from the command line's view.
     pub fn begin(&mut self, start: Start) -> Result<()> {
         self.viewer.sources = start.sources;
         self.viewer.folder = start.folder;
@@ -39,7 +39,7 @@ impl Session {
         Ok(())
     }
 
-    /// Shows a model that was read on its side. One that cannot be read leaves what was there.
+    /// Shows a loaded model on its side. If it could not be read, the old model stays.
     fn show(&mut self, loaded: Loaded) {
         let Loaded { side, path, stamp, model } = loaded;
         let viewer = &mut self.viewer;
@@ -86,7 +86,7 @@ impl Session {
         self.screen.window.request_redraw();
     }
 
-    /// Tells scenes in levels of detail where the camera is.
+    /// Sends the camera to scenes in levels of detail.
     pub fn follow(&mut self) {
         let size = self.screen.size();
         let seen = view(&self.viewer.camera(size), self.viewer.settings.near);
@@ -97,7 +97,7 @@ impl Session {
         }
     }
 
-    /// Draws what scenes in levels of detail have read since.
+    /// Draws newly loaded parts of scenes in levels of detail.
     fn receive_details(&mut self) {
         let viewer = &mut self.viewer;
         for shown in viewer.shown.iter_mut().flatten() {
@@ -115,7 +115,7 @@ impl Session {
         }
     }
 
-    /// Shows what the loader has read.
+    /// Shows newly loaded models.
     pub fn receive(&mut self) {
         self.receive_details();
         while let Some(loaded) = self.loader.next() {
@@ -149,7 +149,7 @@ impl Session {
     /// Looks for models that are new or have changed.
     pub fn poll_files(&mut self) {
         if let Some(folder) = &self.viewer.folder {
-            // While a folder is empty, what was found before stays.
+            // While a folder is empty, keep the old list.
             if let Ok(found) = find_sources(folder) {
                 let other = |s: &Source| !s.path.starts_with(folder);
                 let kept = self.viewer.sources.iter().filter(|s| other(s)).cloned();

@@ -1,4 +1,4 @@
-//! The view of a scene that the command line asks for, and what holds where it says nothing.
+//! The command line's view of a scene, with its defaults.
 
 use std::path::Path;
 
@@ -16,8 +16,8 @@ use crate::viewpoint::{Viewpoint, up_of};
 /// Near plane of small scenes, as a fraction of their radius.
 const NEAR_PART: f64 = 0.05;
 
-/// A capture's cameras: those that were named, else those of the fit that a scene is of. Cameras that nobody
-/// named and that cannot be read are left out, and the note says so.
+/// A capture's cameras: the named ones, else the cameras of the scene's fit. A note reports unnamed
+/// cameras that cannot be read.
 pub fn cameras_of(
     named: Option<&Path>,
     scene: Option<&Path>,
@@ -34,7 +34,7 @@ pub fn cameras_of(
     }
 }
 
-/// Behind the splats: what the command line says, else what the scene was fitted over, else black.
+/// Background color: the command line's, else the fit's, else black.
 pub fn background(arguments: &Arguments, scene: Option<&Path>) -> [f32; 3] {
     let said = arguments.background;
     said.or_else(|| scene.and_then(background_beside)).unwrap_or_default()

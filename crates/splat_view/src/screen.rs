@@ -15,17 +15,17 @@ use winit::window::Window;
 
 use crate::painter::{check_size, side_max};
 
-/// The window's size where nobody names one, in logical pixels.
+/// Default window size, in logical pixels.
 const SIZE: LogicalSize<f64> = LogicalSize::new(1280.0, 720.0);
 
-/// What winit says, without the file and line of its source that it begins with.
+/// winit's error message, without the file and line at its start.
 pub fn reason(error: &impl std::fmt::Display) -> String {
     let text = error.to_string();
     let rest = text.strip_prefix("os error at ").and_then(|text| text.split_once(": "));
     rest.map_or(text.as_str(), |(_, reason)| reason).to_owned()
 }
 
-/// A window with what draws in it.
+/// A window and its renderers.
 pub struct Screen {
     /// The window.
     pub window: Arc<Window>,
@@ -39,7 +39,7 @@ pub struct Screen {
     renderer: egui_wgpu::Renderer,
 }
 
-/// What egui has to paint in one frame; its textures are on the device already.
+/// egui's output for one frame; its textures are on the device already.
 pub struct Interface {
     shapes: Vec<ClippedShape>,
     scale: f32,
@@ -117,7 +117,7 @@ impl Screen {
         })
     }
 
-    /// Tells egui of an event, and asks for a frame if egui wants one.
+    /// Passes an event to egui, and requests a frame if egui wants one.
     pub fn pass_to_egui(&mut self, event: &WindowEvent) {
         let response = self.input.on_window_event(&self.window, event);
         // A frame that asked for the next one would redraw a window without end in which nothing moves.
@@ -170,8 +170,8 @@ impl Screen {
         })
     }
 
-    /// Records the interface onto a target, over what is there or, with `LoadOp::Clear`, alone. The
-    /// command buffers that are returned must be submitted before the encoder's.
+    /// Records the interface onto a target, over its content or, with `LoadOp::Clear`, alone. Submit the
+    /// returned command buffers before the encoder's.
     pub fn record(
         &mut self,
         encoder: &mut wgpu::CommandEncoder,
@@ -213,7 +213,7 @@ impl Screen {
         self.gpu.queue().present(texture);
     }
 
-    /// Frees what only this frame's interface used.
+    /// Frees this frame's textures.
     pub fn finish(&mut self, interface: &Interface) {
         for id in &interface.unused {
             self.renderer.free_texture(id);

@@ -1,4 +1,4 @@
-//! What happens in an open window: one frame after the other, and what the user asks for.
+//! The event loop of an open window: frames and user actions.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -34,9 +34,9 @@ pub struct Session {
     pub screen: Screen,
     /// Draws splats.
     pub painter: Painter,
-    /// What is shown, and how.
+    /// The displayed state.
     pub viewer: Viewer,
-    /// Reads models beside the window.
+    /// Reads models in the background.
     pub loader: Loader,
     /// Wakes the event loop.
     pub proxy: EventLoopProxy<Wake>,
@@ -88,7 +88,7 @@ impl Session {
         self.due.map_or(next, |due| due.min(next))
     }
 
-    /// Runs the panel and the gestures, does what they ask for, and draws.
+    /// Runs the panel and the gestures, handles their actions, and draws.
     pub fn frame(&mut self) -> Result<()> {
         let started = Instant::now();
         let times = self.painter.times.latest();
@@ -220,8 +220,7 @@ impl Session {
         self.say(gpu.check())
     }
 
-    /// Records the models' picture; which stages it has, and what to do with the target before the panel
-    /// is painted.
+    /// Records the models' picture; returns its stages, and the load operation for the panel's pass.
     fn record_scene(
         &mut self,
         encoder: &mut wgpu::CommandEncoder,

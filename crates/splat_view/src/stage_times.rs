@@ -74,7 +74,7 @@ struct Queries {
     is_mapped: Arc<AtomicBool>,
 }
 
-/// Where passes write their timestamps; `first` stands before the numbers of stages.
+/// Timestamp writes of passes; `first` is added to the numbers of stages.
 #[derive(Debug, Clone, Copy)]
 pub struct Stamps<'a> {
     set: Option<&'a wgpu::QuerySet>,
@@ -141,8 +141,8 @@ impl StageTimes {
         Self { queries, last: None }
     }
 
-    /// Where the passes of a frame write, beginning with stage `first`; nowhere while an earlier
-    /// frame's times are being read back.
+    /// Timestamp writes of a frame's passes, from stage `first`; none while an earlier frame's times are
+    /// being read back.
     pub fn stamps(&self, first: usize) -> Stamps<'_> {
         let set = self.queries.as_ref().filter(|q| !q.is_pending).map(|q| &q.set);
         Stamps { set, first }
@@ -163,7 +163,7 @@ impl StageTimes {
     pub fn resolve(&mut self, encoder: &mut wgpu::CommandEncoder, written: Written) {
         let Some(q) = self.queries.as_mut().filter(|q| !q.is_pending) else { return };
         q.written = written;
-        // Only what was written may be resolved.
+        // Only written queries may be resolved.
         for query in (0..COUNT).filter(|&query| query == BEGIN || written[query]) {
             let at = query as u64 * ALIGNMENT;
             encoder.resolve_query_set(&q.set, query as u32..query as u32 + 1, &q.resolved, at);

@@ -1,4 +1,5 @@
-//! What the command line names, read before a window opens: errors are printed where it was typed.
+//! Files named on the command line, read before a window opens so that errors are printed in the
+//! terminal.
 
 use std::path::PathBuf;
 
@@ -9,7 +10,7 @@ use crate::detail::is_in_levels;
 use crate::model::Model;
 use crate::sources::{Source, find_sources};
 
-/// What is shown first.
+/// The first content of the window.
 pub struct Start {
     /// The models that can be chosen.
     pub sources: Vec<Source>,

@@ -1,5 +1,5 @@
-//! Follows the view of a scene in levels of detail: a thread reads what the camera needs, while the window
-//! goes on drawing what is there.
+//! Follows the view of a scene in levels of detail: a thread reads splats for the camera while the window
+//! keeps drawing.
 
 use std::sync::mpsc::{Receiver, Sender, SyncSender, channel, sync_channel};
 use std::time::{Duration, Instant};
@@ -9,7 +9,7 @@ use splat_render::levels::{Choice, Drawn, View};
 
 use crate::detail::Detail;
 
-/// How often what has been read is shown, while more is being read.
+/// Interval at which loaded splats are shown during reading.
 const SHOWN_EVERY: Duration = Duration::from_millis(300);
 
 /// A thread that follows a view; it ends when this goes.
@@ -30,7 +30,7 @@ impl Streaming {
         Self { views, drawn, last: None }
     }
 
-    /// Says where the camera is.
+    /// Sets the camera.
     pub fn look(&mut self, view: View) {
         if self.last != Some(view) {
             self.last = Some(view);
@@ -51,7 +51,7 @@ struct Answers<F> {
 }
 
 impl<F: Fn()> Answers<F> {
-    /// False once nobody listens.
+    /// False once the receiver is gone.
     fn tell(&self, answer: Result<Drawn>) -> bool {
         let is_heard = self.answers.send(answer).is_ok();
         (self.wake)();

@@ -7,9 +7,9 @@
 use glam::{DMat3, DQuat, DVec3};
 use splat_render::io::SplatFile;
 
-/// Up axis where nothing tells: in COLMAP's scenes, and so in most captures, y points down.
+/// Default up axis: in COLMAP's scenes, and so in most captures, y points down.
 pub const USUAL: DVec3 = DVec3::NEG_Y;
-/// Up axes of captures by their conventions: COLMAP's, and that of transforms.json.
+/// Up axes of conventions: COLMAP's, and transforms.json's.
 const CONVENTIONS: [DVec3; 2] = [DVec3::NEG_Y, DVec3::Z];
 /// Splats of a lower opacity logit do not count.
 const FAINT_LOGIT: f32 = 0.0;
@@ -21,11 +21,12 @@ const FLAT: f64 = 0.4;
 const ALIKE: f64 = 0.978;
 /// Directions that are tried.
 const DIRECTIONS: usize = 1500;
-/// What a direction of a convention gains over others, at most.
+/// Maximum bonus of a convention's direction.
 const BONUS: f64 = 1.0;
-/// A plane has at least so many times the weight that directions have on average, and so many splats.
-const CLEAR: f64 = 4.0;
-const FEWEST: usize = 20;
+/// Minimum weight of a plane relative to the mean over directions.
+const MIN_WEIGHT: f64 = 4.0;
+/// Minimum number of splats in a plane.
+const MIN_SPLATS: usize = 20;
 
 /// A splat that is seen.
 struct Flake {
@@ -35,7 +36,7 @@ struct Flake {
     weight: f64,
 }
 
-/// The estimated up axis, a unit vector; [`USUAL`] where the splats have no common plane.
+/// The estimated up axis, a unit vector; [`USUAL`] if the splats have no common plane.
 pub fn up_of_splats(file: &SplatFile, center: DVec3, radius: f64) -> DVec3 {
     estimated(&flakes(file, center, radius)).unwrap_or(USUAL)
 }
@@ -86,14 +87,14 @@ fn estimated(flakes: &[Flake]) -> Option<DVec3> {
     // Directions within the angle cover this part of the sphere's halves.
     let by_chance = total * (1.0 - ALIKE);
     let weight: f64 = along(best).map(|flake| flake.weight).sum();
-    if weight < CLEAR * by_chance || along(best).count() < FEWEST {
+    if weight < MIN_WEIGHT * by_chance || along(best).count() < MIN_SPLATS {
         return None;
     }
     let mean: DVec3 =
         along(best).map(|f| f.normal * (f.weight * f.normal.dot(best).signum())).sum();
     let up = mean.try_normalize()?;
-    // The scene stands on the plane: what is not in it is above. Medians, since few photos leave
-    // large splats below that nothing in them tells the place of.
+    // The scene stands on the plane: up is the side with the rest of the splats. Medians, since few
+    // photos leave large splats below at arbitrary places.
     let height = |is_ground: bool| {
         let there = |flake: &&Flake| (flake.normal.dot(best).abs() > ALIKE) == is_ground;
         median(flakes.iter().filter(there).map(|flake| flake.at.dot(up)).collect())

@@ -45,11 +45,11 @@ pub struct Shown {
     pub model: Model,
     /// On the device.
     pub drawable: Drawable,
-    /// Reads what the view needs of a scene in levels of detail.
+    /// Streams splats of a scene in levels of detail.
     pub streaming: Option<Streaming>,
 }
 
-/// What the panel, keys and gestures ask the session to do.
+/// Requests of the panel, keys and gestures to the session.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Action {
     /// Show a source on a side; None removes the right side.
@@ -58,7 +58,7 @@ pub enum Action {
     Frame,
     /// Move the view to a camera of the capture.
     Jump(usize),
-    /// Move the pivot of orbits to what is at a pixel.
+    /// Move the pivot of orbits to the surface at a pixel.
     Focus([u32; 2]),
     /// Save the picture.
     Screenshot,
@@ -79,9 +79,9 @@ pub struct Viewer {
     pub folder: Option<PathBuf>,
     /// The files chosen for the left and the right side.
     pub chosen: [Option<PathBuf>; 2],
-    /// What is drawn there.
+    /// The drawn models.
     pub shown: [Option<Shown>; 2],
-    /// Where the right side begins, as a fraction of the width.
+    /// Start of the right side, as a fraction of the width.
     pub divider: f32,
     /// Whether the pointer holds the divider.
     pub holds_divider: bool,
@@ -148,7 +148,7 @@ impl Viewer {
         }
     }
 
-    /// Center and radius of what is shown.
+    /// Center and radius of the scene.
     pub fn extent(&self) -> (DVec3, f64) {
         let shown = self.shown.iter().flatten().next();
         shown.map_or((DVec3::ZERO, 1.0), |shown| (shown.model.center, shown.model.radius))
@@ -186,7 +186,7 @@ impl Viewer {
         self.viewpoint = Viewpoint::framing(center, radius, self.up, self.settings.fov);
     }
 
-    /// What a frame of a size shows.
+    /// The content of a frame of a size.
     pub fn shot(&self, size: [u32; 2]) -> Shot<'_> {
         let drawable = |side: usize| self.shown[side].as_ref().map(|shown| &shown.drawable);
         let camera = self.camera(size);
@@ -203,8 +203,8 @@ impl Viewer {
         }
     }
 
-    /// Makes what is under a pixel the pivot of orbits and the center of the picture. False if there is
-    /// nothing.
+    /// Makes the surface at a pixel the pivot of orbits and the center of the picture. False if the pixel
+    /// is empty.
     pub fn focus(
         &mut self,
         painter: &mut Painter,
@@ -228,7 +228,7 @@ impl Viewer {
         self.sources.iter().position(|source| source.path == chosen)
     }
 
-    /// What a file is called.
+    /// Display name of a file.
     pub fn name_of(&self, path: &Path) -> String {
         let found = self.sources.iter().find(|source| source.path == path);
         found.map_or_else(|| path.display().to_string(), |source| label(source, &self.sources))

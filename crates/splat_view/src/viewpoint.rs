@@ -86,7 +86,7 @@ impl Viewpoint {
         self.position = pivot - self.forward() * self.distance;
     }
 
-    /// Moves so that what lies at the pivot follows the pointer: world units to the right and down.
+    /// Moves so that the pivot's plane follows the pointer: world units to the right and down.
     pub fn pan(&mut self, right: f64, down: f64) {
         self.position -= self.right() * right + self.down() * down;
     }
@@ -122,7 +122,7 @@ impl Viewpoint {
         }
     }
 
-    /// A part of the way to another, along an arc where they look at the same point.
+    /// Interpolates to another view, along an arc if both look at the same point.
     pub fn between(&self, other: &Self, part: f64) -> Self {
         let rotation = self.rotation.slerp(other.rotation, part);
         let distance = self.distance + (other.distance - self.distance) * part;
@@ -137,7 +137,7 @@ pub fn relative_to(mut camera: Camera, origin: [f64; 3]) -> Camera {
     camera
 }
 
-/// The camera for a picture of another size that still shows all of its own picture.
+/// The camera for a picture of another size that shows the whole original picture.
 pub fn fitted(camera: &Camera, [width, height]: [u32; 2]) -> Camera {
     let (w, h) = (f64::from(width), f64::from(height));
     let (was_w, was_h) = (f64::from(camera.width), f64::from(camera.height));

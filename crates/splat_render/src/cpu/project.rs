@@ -293,7 +293,7 @@ impl ProjectBlock {
     }
 
     /// Projects the shapes of the splats `ids` of the block that begins with splat `first`, with
-    /// opacities multiplied by `compensation`. Returns the ids of those whose shape is visible.
+    /// opacities multiplied by `compensation`. Returns the ids of the visible ones.
     pub fn shapes(
         &mut self,
         view: &View,

@@ -243,8 +243,8 @@ impl Reached {
         })
     }
 
-    /// Takes the next splats of a tile's list and finds their vectors among those in `live`; returns the
-    /// number of splats.
+    /// Takes the next splats of a tile's list and finds their vectors within `live`; returns the number
+    /// of splats.
     #[inline(always)]
     pub fn find<S: Simd, const OFFSETS: bool>(
         &mut self,

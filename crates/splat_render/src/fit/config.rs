@@ -185,8 +185,8 @@ impl FitConfig {
         (step / interval).min(self.sh_degree)
     }
 
-    /// First step of density control, and the interval between runs: 3DGS's, but short fits get as many
-    /// runs as long ones if every photo has its turn in between.
+    /// First step of density control, and the interval between runs: 3DGS's, but short fits get the same
+    /// number of runs as long ones if every photo has its turn in between.
     pub fn refine_steps(&self) -> (u32, u32) {
         let (start, every) = REFINE;
         ((self.steps / 10).clamp(start / 4, start), (self.steps / 30).clamp(every / 4, every))

@@ -177,7 +177,7 @@ struct Warped {
 /// How a photo's pixels at some depth fall on another photo.
 struct Warp<'a> {
     other: &'a GrayPhoto,
-    /// Pixel (x, y, 1) of the photo to the other's homogeneous pixel, at infinite depth.
+    /// Maps the photo's pixel (x, y, 1) to a homogeneous pixel of the second photo, at infinite depth.
     infinite: DMat3,
     /// Added per unit of 1 / depth.
     epipole: DVec3,

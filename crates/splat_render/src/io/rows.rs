@@ -98,9 +98,10 @@ impl SplatRows {
         Ok(())
     }
 
-    /// The next splats, at most so many; none after the last.
+    /// The next splats, at most `most`; empty at the end.
     ///
     /// # Errors
+    ///
     /// [`crate::Error::File`]: the file cannot be read, or ends early.
     pub fn next(&mut self, most: usize) -> Result<SplatArrays> {
         let named = Named(&self.path);

@@ -3,8 +3,7 @@
 use crate::constants::{SH_COEFFS_MAX, SH_DEGREE_MAX};
 use crate::sh;
 
-/// Directions that a band's functions are compared at: enough for the 9 of degree 4 to be told
-/// apart with room to spare.
+/// Directions at which a band's functions are compared, far more than the 9 functions of degree 4.
 const DIRECTIONS: usize = 64;
 
 /// The matrix of each degree from 1 on, `[2 degree + 1]^2`, that gives the turned coefficients.

@@ -114,7 +114,7 @@ pub fn choose(manifest: &Manifest, view: &View, budget: usize) -> Choice {
     out
 }
 
-/// All cells at their coarsest level, as many as the budget permits.
+/// All cells at their coarsest level, as far as the budget permits.
 pub fn coarsest(manifest: &Manifest, budget: usize) -> Choice {
     let cells = &manifest.cells;
     let mut out = Choice { levels: vec![None; cells.len()], order: Vec::new(), held: 0 };

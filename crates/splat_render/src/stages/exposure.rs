@@ -29,14 +29,13 @@ impl<T: Float> Exposure<T> {
         Self { gain: [T::one(); 3], offset: [T::zero(); 3], background: None }
     }
 
-    /// How a color grows with the transmittance: b - gain b - offset, 0 where there is no
-    /// background to keep.
+    /// Change of a color per unit of transmittance: b - gain b - offset, 0 without a background.
     pub(crate) fn behind(&self) -> [T; 3] {
         let Some(background) = self.background else { return [T::zero(); 3] };
         std::array::from_fn(|c| background[c] - self.gain[c] * background[c] - self.offset[c])
     }
 
-    /// What of a corrected color's gradient `v` goes back, where the color was `raw` before the cut.
+    /// The part of a corrected color's gradient `v` that passes the clamp; `raw` is the color before it.
     #[inline(always)]
     pub(crate) fn passed(raw: T, v: T) -> T {
         let leaves = (raw > T::one() && v < T::zero()) || (raw < T::zero() && v > T::zero());

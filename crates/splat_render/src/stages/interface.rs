@@ -74,8 +74,8 @@ pub trait Stages<T: Float> {
         self.exposure_unchecked(image, exposure)
     }
 
-    /// Computes gradients of the picture, gain and offset from gradients of the corrected colors,
-    /// `[H * W]`. The other arguments are those of [`Stages::exposure`].
+    /// Computes gradients of the picture, gain and offset from gradients of the corrected colors, `[H *
+    /// W]`. Arguments as in [`Stages::exposure`].
     fn exposure_backward(
         &self,
         image: &Image<T>,

@@ -1,7 +1,7 @@
 //! The data that passes between the stages, and [`Stages`], the trait of all implementations.
 //!
-//! All arrays are on the host; an implementation may keep its own copies where its kernels run.
-//! `T` is f64 in the reference and f32 elsewhere.
+//! All arrays are on the host; an implementation may copy them to its device. `T` is f64 in the reference
+//! and f32 elsewhere.
 
 mod depth_loss;
 mod exposure;
@@ -40,9 +40,9 @@ pub struct ProjectOptions {
     pub far: f32,
     /// Variance in px^2 added to both axes of the 2D covariance.
     pub blur: f32,
-    /// Whether opacities are lowered by what the blur adds to a splat's area, so that a splat
-    /// seen small keeps its weight in the picture: times sqrt(det S / det(S + blur I)), S the 2D
-    /// covariance without blur (the 2D filter of Mip-Splatting, Yu et al. 2024, section 4.2).
+    /// Whether opacities are lowered to compensate for the area that the blur adds, so that small splats
+    /// keep their weight in the picture: times sqrt(det S / det(S + blur I)), S the 2D covariance without
+    /// blur (the 2D filter of Mip-Splatting, Yu et al. 2024, section 4.2).
     pub antialiased: bool,
 }
 
@@ -80,8 +80,8 @@ impl ProjectOptions {
         Ok(())
     }
 
-    /// The least depth that is drawn. It is above 0 even where `near` is 0: a splat at the camera's
-    /// plane or behind it has no picture.
+    /// Minimum depth of drawn splats. Above 0 even if `near` is 0: splats at or behind the camera's plane
+    /// have no projection.
     pub fn nearest(&self) -> f32 {
         self.near.max(f32::MIN_POSITIVE)
     }
@@ -103,7 +103,7 @@ pub struct Projected<T> {
     pub depths: Vec<T>,
     /// Colors.
     pub colors: Vec<[T; 3]>,
-    /// Opacities in 0..1, lowered where the project stage was told to (antialiased).
+    /// Opacities in 0..1, including the antialiasing factor.
     pub opacities: Vec<T>,
     /// Half-sides in px of the box outside which alpha < `ALPHA_MIN`.
     pub radii: Vec<[T; 2]>,
@@ -237,13 +237,13 @@ pub struct ProjectedGradients<T> {
     pub v_opacities: Vec<T>,
     /// Gradient of the background color.
     pub v_background: [T; 3],
-    /// `[N]` sums over pixels of the absolute value of each pixel's part of `v_means2d`, where
-    /// asked for (AbsGS, Ye et al. 2024; gsplat's `absgrad`); project_backward does not read it.
+    /// `[N]` sums over pixels of the absolute value of each pixel's part of `v_means2d`, on request
+    /// (AbsGS, Ye et al. 2024; gsplat's `absgrad`); project_backward does not read it.
     pub v_means2d_absolute: Option<Vec<[T; 2]>>,
 }
 
 impl<T> ProjectedGradients<T> {
-    /// Checks that these and the `projected` splats are as many as the splats.
+    /// Checks the lengths of the gradients and of the `projected` splats against the number of splats.
     pub fn validate(&self, splats: usize, projected: usize) -> Result<()> {
         let lengths = [
             ("projected", projected),
@@ -295,7 +295,7 @@ pub struct SplatGradients<T> {
 /// Loss of a picture against a photo.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Loss<T> {
-    /// The loss; 0 where the photo is masked out everywhere.
+    /// The loss; 0 if the photo is masked out everywhere.
     pub value: T,
     /// `[H * W]` its gradient with respect to the picture's colors.
     pub v_color: Vec<[T; 3]>,
@@ -314,7 +314,7 @@ pub struct Rates {
     pub opacities: f32,
     /// SH coefficient 0.
     pub sh0: f32,
-    /// The other SH coefficients.
+    /// Higher SH coefficients.
     pub sh_rest: f32,
 }
 
@@ -324,7 +324,7 @@ impl Rates {
         Self { means: 0.0, quats: 0.0, scales: 0.0, opacities: 0.0, sh0: 0.0, sh_rest: 0.0 };
 }
 
-/// What one step of the optimizer is to do.
+/// Settings of one optimizer step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AdamStep {
     /// Number of the step, from 1, for the bias correction.
@@ -352,8 +352,8 @@ impl AdamStep {
         self.rates == Rates::ZERO
     }
 
-    /// What Adam's moments of this step are multiplied by, since they began at 0 (Kingma and Ba,
-    /// 2015, algorithm 1): 1 / (1 - beta^number), for the first and the second.
+    /// Bias corrections of Adam's first and second moments at this step (Kingma and Ba, 2015, algorithm
+    /// 1): 1 / (1 - beta^number).
     pub fn bias(&self) -> [f64; 2] {
         let number = self.number.min(i32::MAX as u32) as i32;
         [ADAM.0, ADAM.1].map(|beta| 1.0 / (1.0 - f64::from(beta).powi(number)))

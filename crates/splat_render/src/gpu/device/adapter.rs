@@ -99,7 +99,7 @@ impl Gpu {
     ) -> Result<(Self, wgpu::Adapter, wgpu::Surface<'static>)> {
         let instance = instance();
         let mut adapters = adapters(&instance);
-        // Without a driver there is no surface, and wgpu's error message does not name the cause.
+        // Without a driver there is no surface, and wgpu's error does not name the cause.
         if !adapters.is_empty() {
             let surface = instance
                 .create_surface(window)

@@ -14,13 +14,13 @@ use crate::io::bytes::Named;
 use crate::io::limits::unpacked_max;
 use crate::io::open::open_file;
 
-/// Pixels that an image may have beyond those that are used: writers round sizes up.
+/// Unused pixels that an image may have: writers round sizes up.
 const SPARE_PIXELS: u64 = 1 << 16;
 
 /// Longest meta.json that is read: real ones are 20 kB, and JSON takes many times its text.
 const META_MAX: u64 = 1 << 20;
 
-/// Where the files lie.
+/// Location of the files.
 enum Place<'a> {
     /// The zip of a `.sog`, and the bytes that an entry may unpack to.
     Zip(Box<ZipArchive<Cursor<&'a [u8]>>>, u64),
@@ -43,7 +43,7 @@ impl<'a> Bundle<'a> {
         Ok(Self { place: Place::Zip(Box::new(zip), unpacked_max(bytes.len())), named: *named })
     }
 
-    /// The files beside the `meta.json` that is named.
+    /// The files next to a `meta.json`.
     pub fn beside(named: &Named<'a>) -> Self {
         let folder = named.0.parent().unwrap_or(Path::new("")).to_owned();
         Self { place: Place::Folder(folder), named: *named }
@@ -73,7 +73,7 @@ impl<'a> Bundle<'a> {
         Ok((file, size))
     }
 
-    /// The first `limit` bytes of the file `name`; None: what may be unpacked.
+    /// The first `limit` bytes of the file `name`; None means the limit for unpacked data.
     fn file(&mut self, name: &str, limit: impl Into<Option<u64>>) -> Result<Vec<u8>> {
         let (limit, named) = (limit.into(), self.named);
         let mut bytes = Vec::new();
