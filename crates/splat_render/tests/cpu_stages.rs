@@ -1,5 +1,6 @@
 //! The CPU implementation against the reference, stage by stage and end to end.
 
+#[macro_use]
 mod common;
 
 use common::conformance::{Bounds, OPTIONS, SIZES, end_to_end, project_stages, rasterize_stages};
@@ -55,61 +56,6 @@ fn end_to_end_matches_the_reference() {
     }
 }
 
-#[test]
-fn hard_scenes_agree_with_the_reference() {
-    common::hard_cases::hard_scenes_agree_with_the_reference(&Cpu, BOUNDS);
-}
-
-#[test]
-fn no_splats_give_the_background() {
-    common::hard_cases::no_splats_give_the_background(&Cpu);
-}
-
-#[test]
-fn poison_in_any_slot_culls_one_splat_at_most() {
-    common::hard_cases::poison_in_any_slot_culls_one_splat_at_most(&Cpu);
-}
-
-#[test]
-fn hard_splats_2d_agree_with_the_reference() {
-    common::hard_cases::hard_splats_2d_agree_with_the_reference(&Cpu, BOUNDS);
-}
-
-#[test]
-fn many_splats_in_one_tile_and_one_on_many() {
-    common::hard_cases::many_splats_in_one_tile_and_one_on_many(&Cpu, BOUNDS);
-}
-
-#[test]
-fn a_zero_quaternion_culls_its_splat() {
-    common::hard_cases::a_zero_quaternion_culls_its_splat(&Cpu);
-}
-
-#[test]
-fn thresholds_are_the_same_everywhere() {
-    common::hard_cases::thresholds_are_the_same_everywhere(&Cpu);
-}
-
-#[test]
-fn tile_edges_show_nothing() {
-    common::hard_cases::tile_edges_show_nothing(&Cpu, BOUNDS);
-}
-
-#[test]
-fn any_values_give_finite_results() {
-    common::properties::any_values_give_finite_results(&Cpu, 1000);
-}
-
-#[test]
-fn the_order_of_splats_does_not_matter() {
-    common::properties::the_order_of_splats_does_not_matter(&Cpu, 100);
-}
-
-#[test]
-fn drawn_pictures_match_the_reference() {
-    common::properties::drawn_pictures_match_the_reference(&Cpu, BOUNDS, 100);
-}
-
 /// Pictures and gradients, on one thread to eight.
 #[test]
 fn the_number_of_threads_changes_no_bit() {
@@ -135,52 +81,27 @@ fn the_number_of_threads_changes_no_bit() {
     }
 }
 
-#[test]
-fn culled_splats_change_nothing() {
-    common::hard_cases::culled_splats_change_nothing(&Cpu);
-}
-
-#[test]
-fn a_far_away_scene_renders_as_one_at_the_origin() {
-    common::hard_cases::a_far_away_scene_renders_as_one_at_the_origin(&Cpu);
-}
-
-#[test]
-fn depth_loss_matches_the_reference() {
-    common::optimization::depth_loss_matches_the_reference(&Cpu);
-}
-
-#[test]
-fn exposure_matches_the_reference() {
-    common::optimization::exposure_matches_the_reference(&Cpu);
-}
-
-#[test]
-fn loss_matches_the_reference() {
-    common::optimization::loss_matches_the_reference(&Cpu);
-}
-
-#[test]
-fn adam_matches_the_reference() {
-    common::optimization::adam_matches_the_reference(&Cpu);
-}
-
-#[test]
-fn frozen_splats_keep_their_moments() {
-    common::optimization::frozen_splats_keep_their_moments(&Cpu);
-}
-
-#[test]
-fn depths_that_are_not_positive_are_not_drawn() {
-    common::agreement::depths_that_are_not_positive_are_not_drawn(&Cpu);
-}
-
-#[test]
-fn a_near_plane_of_zero_draws_what_is_before_the_camera() {
-    common::agreement::a_near_plane_of_zero_draws_what_is_before_the_camera(&Cpu);
-}
-
-#[test]
-fn senseless_options_are_refused() {
-    common::agreement::senseless_options_are_refused(&Cpu);
+checks! {
+    [&Cpu];
+    hard_cases::hard_scenes_agree_with_the_reference(BOUNDS);
+    hard_cases::no_splats_give_the_background();
+    hard_cases::poison_in_any_slot_culls_one_splat_at_most();
+    hard_cases::hard_splats_2d_agree_with_the_reference(BOUNDS);
+    hard_cases::many_splats_in_one_tile_and_one_on_many(BOUNDS);
+    hard_cases::a_zero_quaternion_culls_its_splat();
+    hard_cases::thresholds_are_the_same_everywhere();
+    hard_cases::tile_edges_show_nothing(BOUNDS);
+    properties::any_values_give_finite_results(1000);
+    properties::the_order_of_splats_does_not_matter(100);
+    properties::drawn_pictures_match_the_reference(BOUNDS, 100);
+    hard_cases::culled_splats_change_nothing();
+    hard_cases::a_far_away_scene_renders_as_one_at_the_origin();
+    optimization::depth_loss_matches_the_reference();
+    optimization::exposure_matches_the_reference();
+    optimization::loss_matches_the_reference();
+    optimization::adam_matches_the_reference();
+    optimization::frozen_splats_keep_their_moments();
+    agreement::invalid_2d_splats_are_not_drawn();
+    agreement::a_near_plane_of_zero_draws_what_is_before_the_camera();
+    agreement::senseless_options_are_refused();
 }

@@ -1,5 +1,6 @@
 //! The WGSL stages against the f64 reference, stage by stage and end to end.
 
+#[macro_use]
 mod common;
 
 use std::ops::Range;
@@ -10,7 +11,7 @@ use common::*;
 use rand::Rng;
 use splat_render::gpu::{Gpu, ResidentPicture, ResidentSplats, ResidentView};
 use splat_render::reference::Reference;
-use splat_render::stages::{ImageGradients, Projected};
+use splat_render::stages::ImageGradients;
 use splat_render::{Camera, ProjectOptions, Stages};
 
 /// Any adapter will do, lavapipe included; none at all fails the test with the error's sentence.
@@ -236,128 +237,35 @@ fn software_adapters_are_used_only_when_allowed() {
     }
 }
 
-#[test]
-fn bad_arguments_are_named() {
-    let mut projected = random_projected(&mut rng(12), 5, 20, 20, 2.0);
-    projected.depths.pop();
-    let error = gpu().rasterize(&projected, [0.0; 3]).unwrap_err().to_string();
-    assert!(error.starts_with("depths: "), "{error}");
-    let projected = Projected::<f32>::culled(0, 0, 5);
-    let error = gpu().rasterize(&projected, [0.0; 3]).unwrap_err().to_string();
-    assert!(error.starts_with("width, height: "), "{error}");
+checks! {
+    [gpu()];
+    hard_cases::hard_scenes_agree_with_the_reference(BOUNDS);
+    hard_cases::no_splats_give_the_background();
+    hard_cases::poison_in_any_slot_culls_one_splat_at_most();
+    hard_cases::culled_splats_change_nothing();
+    hard_cases::a_far_away_scene_renders_as_one_at_the_origin();
+    hard_cases::a_zero_quaternion_culls_its_splat();
+    properties::any_values_give_finite_results(200);
+    properties::the_order_of_splats_does_not_matter(40);
+    properties::drawn_pictures_match_the_reference(BOUNDS, 60);
+    optimization::depth_loss_matches_the_reference();
+    optimization::exposure_matches_the_reference();
+    optimization::adam_matches_the_reference();
+    optimization::frozen_splats_keep_their_moments();
+    agreement::invalid_2d_splats_are_not_drawn();
+    agreement::a_near_plane_of_zero_draws_what_is_before_the_camera();
+    agreement::senseless_options_are_refused();
 }
 
-#[test]
-fn hard_scenes_agree_with_the_reference() {
-    common::hard_cases::hard_scenes_agree_with_the_reference(gpu(), BOUNDS);
+checks! {
+    [gpu(), plain(), discrete()];
+    hard_cases::hard_splats_2d_agree_with_the_reference(BOUNDS);
+    hard_cases::many_splats_in_one_tile_and_one_on_many(BOUNDS);
+    hard_cases::thresholds_are_the_same_everywhere();
+    hard_cases::tile_edges_show_nothing(BOUNDS);
 }
 
-#[test]
-fn no_splats_give_the_background() {
-    common::hard_cases::no_splats_give_the_background(gpu());
-}
-
-#[test]
-fn poison_in_any_slot_culls_one_splat_at_most() {
-    common::hard_cases::poison_in_any_slot_culls_one_splat_at_most(gpu());
-}
-
-#[test]
-fn hard_splats_2d_agree_with_the_reference() {
-    for gpu in [gpu(), plain(), discrete()] {
-        common::hard_cases::hard_splats_2d_agree_with_the_reference(gpu, BOUNDS);
-    }
-}
-
-#[test]
-fn many_splats_in_one_tile_and_one_on_many() {
-    for gpu in [gpu(), plain(), discrete()] {
-        common::hard_cases::many_splats_in_one_tile_and_one_on_many(gpu, BOUNDS);
-    }
-}
-
-#[test]
-fn culled_splats_change_nothing() {
-    common::hard_cases::culled_splats_change_nothing(gpu());
-}
-
-#[test]
-fn a_far_away_scene_renders_as_one_at_the_origin() {
-    common::hard_cases::a_far_away_scene_renders_as_one_at_the_origin(gpu());
-}
-
-#[test]
-fn a_zero_quaternion_culls_its_splat() {
-    common::hard_cases::a_zero_quaternion_culls_its_splat(gpu());
-}
-
-#[test]
-fn thresholds_are_the_same_everywhere() {
-    for gpu in [gpu(), plain(), discrete()] {
-        common::hard_cases::thresholds_are_the_same_everywhere(gpu);
-    }
-}
-
-#[test]
-fn tile_edges_show_nothing() {
-    for gpu in [gpu(), plain(), discrete()] {
-        common::hard_cases::tile_edges_show_nothing(gpu, BOUNDS);
-    }
-}
-
-#[test]
-fn any_values_give_finite_results() {
-    common::properties::any_values_give_finite_results(gpu(), 200);
-}
-
-#[test]
-fn the_order_of_splats_does_not_matter() {
-    common::properties::the_order_of_splats_does_not_matter(gpu(), 40);
-}
-
-#[test]
-fn drawn_pictures_match_the_reference() {
-    common::properties::drawn_pictures_match_the_reference(gpu(), BOUNDS, 60);
-}
-
-#[test]
-fn depth_loss_matches_the_reference() {
-    common::optimization::depth_loss_matches_the_reference(gpu());
-}
-
-#[test]
-fn exposure_matches_the_reference() {
-    common::optimization::exposure_matches_the_reference(gpu());
-}
-
-#[test]
-fn loss_matches_the_reference() {
-    for gpu in [gpu(), discrete()] {
-        common::optimization::loss_matches_the_reference(gpu);
-    }
-}
-
-#[test]
-fn adam_matches_the_reference() {
-    common::optimization::adam_matches_the_reference(gpu());
-}
-
-#[test]
-fn frozen_splats_keep_their_moments() {
-    common::optimization::frozen_splats_keep_their_moments(gpu());
-}
-
-#[test]
-fn depths_that_are_not_positive_are_not_drawn() {
-    common::agreement::depths_that_are_not_positive_are_not_drawn(gpu());
-}
-
-#[test]
-fn a_near_plane_of_zero_draws_what_is_before_the_camera() {
-    common::agreement::a_near_plane_of_zero_draws_what_is_before_the_camera(gpu());
-}
-
-#[test]
-fn senseless_options_are_refused() {
-    common::agreement::senseless_options_are_refused(gpu());
+checks! {
+    [gpu(), discrete()];
+    optimization::loss_matches_the_reference();
 }

@@ -9,23 +9,35 @@ use splat_render::{Error, ProjectOptions, Stages};
 use super::optimization::{full_step, random_adam, random_picture, random_target};
 use super::*;
 
-/// A 2D splat at or behind the camera's plane is not drawn and has no gradient.
-pub fn depths_that_are_not_positive_are_not_drawn(stages: &dyn Stages<f32>) {
+/// A 2D splat at or behind the camera's plane, or with values that are not finite, is not drawn and has
+/// no gradient.
+pub fn invalid_2d_splats_are_not_drawn(stages: &dyn Stages<f32>) {
     let good = random_projected(&mut rng(90), 30, 40, 30, 4.0);
     let mut without = good.clone();
     without.radii[7] = [0.0; 2];
     let expected = stages.rasterize(&without, [0.1; 3]).unwrap();
-    for depth in [0.0, -0.0, -1.0, -1e30, f32::NAN] {
-        let mut behind = good.clone();
-        behind.depths[7] = depth;
-        let image = stages.rasterize(&behind, [0.1; 3]).unwrap();
-        assert!(image == expected, "a splat at depth {depth} is drawn");
-        let v_image = random_image_gradients(&mut rng(91), image.alpha.len());
-        let v = stages.rasterize_backward(&behind, [0.1; 3], &image, &v_image, true).unwrap();
-        let none = v.v_means2d[7] == [0.0; 2]
-            && v.v_colors[7] == [0.0; 3]
-            && (v.v_opacities[7], v.v_depths[7]) == (0.0, 0.0);
-        assert!(none, "a splat at depth {depth} has a gradient");
+    let not_finite = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY];
+    type Spoil = fn(&mut Projected<f32>, f32);
+    let cases: [(&str, Spoil, &[f32]); 5] = [
+        ("depth", |p, v| p.depths[7] = v, &[0.0, -0.0, -1.0, -1e30, f32::NAN]),
+        ("mean", |p, v| p.means2d[7][0] = v, &not_finite),
+        ("factor", |p, v| p.factors[7][1] = v, &not_finite),
+        ("radius", |p, v| p.radii[7][1] = v, &not_finite),
+        ("opacity", |p, v| p.opacities[7] = v, &not_finite),
+    ];
+    for (name, spoil, values) in cases {
+        for &value in values {
+            let mut bad = good.clone();
+            spoil(&mut bad, value);
+            let image = stages.rasterize(&bad, [0.1; 3]).unwrap();
+            assert!(image == expected, "a splat with {name} {value} is drawn");
+            let v_image = random_image_gradients(&mut rng(91), image.alpha.len());
+            let v = stages.rasterize_backward(&bad, [0.1; 3], &image, &v_image, true).unwrap();
+            let none = v.v_means2d[7] == [0.0; 2]
+                && v.v_colors[7] == [0.0; 3]
+                && (v.v_opacities[7], v.v_depths[7]) == (0.0, 0.0);
+            assert!(none, "a splat with {name} {value} has a gradient");
+        }
     }
 }
 
@@ -73,9 +85,21 @@ pub fn senseless_options_are_refused(stages: &dyn Stages<f32>) {
         let backward = stages.project_backward(&scene.params(), &camera, &options, &projected, &v);
         assert_eq!(named(backward), name, "{options:?}");
     }
-    let no_size = Projected { width: 0, ..projected.clone() };
-    let backward = stages.project_backward(&scene.params(), &camera, &good, &no_size, &v);
-    assert_eq!(named(backward), "width, height");
+    type Spoil = fn(&mut Projected<f32>);
+    let spoiled: [(&str, Spoil); 5] = [
+        ("width, height", |p| p.width = 0),
+        ("width, height", |p| (p.width, p.height) = (1 << 30, 1 << 30)),
+        ("factors", |p| p.factors.truncate(4)),
+        ("depths", |p| p.depths.clear()),
+        ("radii", |p| p.radii.push([1.0; 2])),
+    ];
+    for (name, spoil) in spoiled {
+        let mut bad = projected.clone();
+        spoil(&mut bad);
+        assert_eq!(named(stages.rasterize(&bad, [0.0; 3])), name);
+        let backward = stages.project_backward(&scene.params(), &camera, &good, &bad, &v);
+        assert_eq!(named(backward), name);
+    }
 
     // The same number of pixels, otherwise laid out.
     let mut image = stages.rasterize(&projected, [0.0; 3]).unwrap();

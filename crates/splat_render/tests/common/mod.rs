@@ -1,6 +1,19 @@
 //! Seeded random scenes, f32/f64 conversions and comparators, shared by the tests of all backends.
 #![allow(dead_code)] // Each test binary uses its own part.
 
+/// Declares a test of each check, run on each of `$stages`.
+#[allow(unused_macros)]
+macro_rules! checks {
+    ($stages:expr; $($module:ident::$check:ident($($argument:expr),*);)*) => {
+        $(#[test]
+        fn $check() {
+            for stages in $stages {
+                common::$module::$check(stages, $($argument),*);
+            }
+        })*
+    };
+}
+
 pub mod agreement;
 pub mod conformance;
 pub mod hard_cases;
