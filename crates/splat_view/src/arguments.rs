@@ -8,7 +8,6 @@ use splat_render::{Error, Result};
 
 use crate::display::Drawing;
 
-/// Text of `--help`.
 pub const HELP: &str = "\
 Show Gaussian splats in a window, or draw pictures of them.
 
@@ -52,28 +51,19 @@ pub enum Backend {
     Auto,
     /// Any adapter, software ones too.
     Gpu,
-    /// The CPU.
     Cpu,
 }
 
-/// The command line.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Arguments {
-    /// Files and folders to show.
     pub scenes: Vec<PathBuf>,
-    /// File for one picture.
     pub screenshot: Option<PathBuf>,
     /// Folder for pictures of a full turn.
     pub frames: Option<PathBuf>,
-    /// Frames to time.
     pub time: Option<u32>,
-    /// Width and height in pixels.
     pub size: Option<[u32; 2]>,
-    /// Backend of the rasterizer.
     pub backend: Backend,
-    /// Renderer in the window.
     pub drawing: Drawing,
-    /// File or folder of the capture's cameras.
     pub cameras: Option<PathBuf>,
     /// Maximum number of splats of a scene in levels of detail.
     pub budget: Option<usize>,
@@ -91,18 +81,13 @@ pub struct Arguments {
     pub background: Option<[f32; 3]>,
 }
 
-/// A parsed command line.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Asked {
-    /// Print [`HELP`].
     Help,
-    /// Print the version.
     Version,
-    /// Show or draw.
     Run(Box<Arguments>),
 }
 
-/// Most pictures of a turn.
 const FRAMES_MAX: f64 = 100_000.0;
 
 impl Arguments {
@@ -174,7 +159,6 @@ impl Arguments {
         Ok(Asked::Run(Box::new(out)))
     }
 
-    /// Whether no window is to open.
     pub fn is_headless(&self) -> bool {
         self.screenshot.is_some() || self.frames.is_some() || self.time.is_some()
     }

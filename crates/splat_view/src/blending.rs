@@ -26,7 +26,6 @@ struct Style {
     padding: [f32; 2],
 }
 
-/// A model on the device.
 #[derive(Debug)]
 pub struct Drawable {
     resident: ResidentSplats,
@@ -37,7 +36,6 @@ pub struct Drawable {
 }
 
 impl Drawable {
-    /// Its splats.
     pub fn splats(&self) -> &ResidentSplats {
         &self.resident
     }
@@ -53,12 +51,10 @@ impl Drawable {
     }
 }
 
-/// The pipeline.
 #[derive(Debug)]
 pub struct Blending(Pipeline);
 
 impl Blending {
-    /// Compiles it.
     pub fn new(gpu: &Gpu) -> Self {
         let storage = |binding| storage_layout(binding, wgpu::ShaderStages::VERTEX);
         Self(Pipeline::new(
@@ -81,7 +77,6 @@ impl Blending {
         ))
     }
 
-    /// Copies a model to the device.
     pub fn upload(&self, gpu: &Gpu, file: &SplatFile) -> Result<Drawable> {
         let resident = ResidentSplats::new(gpu, &file.splats.params(file.splats.sh_degree))?;
         let style = uniform::<Style>(gpu);
@@ -154,7 +149,6 @@ impl Blending {
 }
 
 impl Settings {
-    /// Whether canvases hold depths.
     pub fn is_depth(&self) -> bool {
         self.display == Display::Depth
     }

@@ -9,7 +9,6 @@ use crate::viewpoint::Viewpoint;
 /// Marked places, in their order.
 #[derive(Debug, Clone, Default)]
 pub struct CameraPath {
-    /// The places.
     pub keys: Vec<Viewpoint>,
 }
 
@@ -53,9 +52,7 @@ pub struct Recording {
     path: CameraPath,
     /// Pictures from each place to the next, as set at the start.
     between: u32,
-    /// Folder of the pictures.
     pub folder: PathBuf,
-    /// Number of the next picture.
     pub next: u32,
 }
 
@@ -65,7 +62,6 @@ impl Recording {
         Self { path: path.clone(), between: between.max(1), folder, next: 0 }
     }
 
-    /// Pictures in all.
     pub fn total(&self) -> u32 {
         self.path.pictures(self.between)
     }

@@ -28,7 +28,6 @@ use serde::Deserialize;
 use splat_render::io::open_file;
 use splat_render::{Camera, Error, Result};
 
-/// The file's name in a folder.
 const NAME: &str = "cameras.json";
 /// Largest file that is read, in bytes: some 100,000 cameras as igsr writes them.
 const FILE_MAX: u64 = 64 << 20;
@@ -36,10 +35,8 @@ const FILE_MAX: u64 = 64 << 20;
 const OTHERS: &str = "igsr view shows other captures too (COLMAP, transforms.json), and igsr export \
                       --format transforms rewrites them for splat-view";
 
-/// A photo's camera.
 #[derive(Debug, Clone)]
 pub struct CaptureCamera {
-    /// The photo's name in the capture.
     pub name: String,
     /// The photo, if the file exists.
     pub photo: Option<PathBuf>,

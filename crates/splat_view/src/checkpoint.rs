@@ -16,7 +16,6 @@ use zip::{CompressionMethod, ZipArchive};
 /// Longest array header that is read, bytes.
 const HEADER_MAX: usize = 4096;
 
-/// Reads the splats of a checkpoint.
 pub fn read_checkpoint(path: &Path) -> Result<SplatFile> {
     let bad = |what: String| {
         Error::file(path, format!("is no checkpoint of igsr fit ({what}); give its scene.ply"))
@@ -56,7 +55,6 @@ pub fn read_checkpoint(path: &Path) -> Result<SplatFile> {
 
 type Reason = String;
 
-/// A member's shape and bytes.
 fn read_member<R: Read + Seek>(
     archive: &mut ZipArchive<R>,
     name: &str,

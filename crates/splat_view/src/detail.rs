@@ -13,12 +13,10 @@ pub const BUDGET: usize = 1_000_000;
 /// covers a part of a pixel and is drawn as large as one.
 const FINE: f64 = 1.5;
 
-/// Whether a path is a scene in levels of detail.
 pub fn is_in_levels(path: &Path) -> bool {
     path.file_name().is_some_and(|name| name == INDEX)
 }
 
-/// The view from a camera.
 pub fn view(camera: &Camera, near: f32) -> View {
     View { camera: *camera, near: f64::from(near), pixels: FINE }
 }
@@ -74,7 +72,6 @@ impl Detail {
         self.resident.most
     }
 
-    /// The levels for a view.
     pub fn choose(&self, view: &View) -> Choice {
         choose(&self.manifest, view, self.resident.room())
     }

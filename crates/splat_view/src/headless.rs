@@ -22,10 +22,8 @@ use crate::stage_times::STAGES;
 use crate::start::no_levels;
 use crate::viewpoint::{Viewpoint, fitted, relative_to};
 
-/// Default size of pictures.
 const SIZE: [u32; 2] = [1280, 720];
 
-/// The scene to draw.
 struct Scene {
     /// If in levels of detail, holds the splats for the last picture's camera.
     model: Model,
@@ -35,7 +33,6 @@ struct Scene {
     up: glam::DVec3,
 }
 
-/// Runs a command line without a window.
 pub fn run(arguments: &Arguments) -> Result<()> {
     let mut scene = Scene::new(arguments)?;
     if let Some(frames) = arguments.time {

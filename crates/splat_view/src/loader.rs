@@ -13,11 +13,9 @@ use crate::sources::{Stamp, stamp};
 pub struct Loaded {
     /// The side it is for, 0 or 1.
     pub side: usize,
-    /// The file.
     pub path: PathBuf,
     /// The file's stamp before it was read.
     pub stamp: Option<Stamp>,
-    /// The model.
     pub model: Result<Model>,
 }
 
@@ -28,18 +26,15 @@ pub struct Loader {
     receiver: Receiver<Loaded>,
     /// The file that each side waits for.
     waits: [Option<PathBuf>; 2],
-    /// Maximum number of splats of a scene in levels of detail.
     budget: Option<usize>,
 }
 
 impl Loader {
-    /// Nothing to read yet.
     pub fn new(budget: Option<usize>) -> Self {
         let (sender, receiver) = channel();
         Self { sender, receiver, waits: [None, None], budget }
     }
 
-    /// Whether a side waits for a model.
     pub fn is_busy(&self, side: usize) -> bool {
         self.waits[side].is_some()
     }

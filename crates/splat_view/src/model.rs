@@ -14,10 +14,8 @@ const FAINT_LOGIT: f32 = -2.2;
 /// Number of splats that the extent is computed from.
 const SAMPLES: usize = 100_000;
 
-/// A scene in memory.
 #[derive(Debug)]
 pub struct Model {
-    /// Its splats and their origin.
     pub file: SplatFile,
     /// Center of the visible splats, in world coordinates.
     pub center: DVec3,

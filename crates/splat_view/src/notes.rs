@@ -7,7 +7,6 @@ const MOST: usize = 6;
 /// How long a note stays at least once others follow.
 const STAYS: Duration = Duration::from_secs(60);
 
-/// A text, and since when it is shown.
 #[derive(Debug, Clone)]
 struct Note {
     text: String,
@@ -16,7 +15,6 @@ struct Note {
     is_state: bool,
 }
 
-/// The notes that are shown.
 #[derive(Debug, Clone, Default)]
 pub struct Notes(Vec<Note>);
 
@@ -32,7 +30,6 @@ impl Notes {
         self.push(text.into(), true, Instant::now());
     }
 
-    /// Whether a text is shown.
     pub fn has(&self, text: &str) -> bool {
         self.0.iter().any(|note| note.text == text)
     }

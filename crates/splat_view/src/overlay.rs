@@ -68,7 +68,6 @@ pub fn cameras(
     }
 }
 
-/// Lays a photo over the picture from its camera.
 pub fn photo(viewer: &Viewer, ui: &Ui, size: [u32; 2], texture: &TextureHandle) {
     let Some(at) = viewer.at_camera.and_then(|i| viewer.cameras.get(i)) else { return };
     if viewer.photo_strength <= 0.0 {

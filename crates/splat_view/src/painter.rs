@@ -16,7 +16,6 @@ use crate::stage_times::{
     Stamps, Written,
 };
 
-/// Format of pictures that are read back.
 const PICTURE: wgpu::TextureFormat = wgpu::TextureFormat::Rgba8Unorm;
 /// Alignment of the rows of a copied texture, bytes.
 const ROW: u32 = wgpu::COPY_BYTES_PER_ROW_ALIGNMENT;
@@ -41,16 +40,13 @@ pub fn check_size(gpu: &Gpu, [width, height]: [u32; 2]) -> Result<()> {
     ))
 }
 
-/// The content of a frame.
 #[derive(Debug, Clone, Copy)]
 pub struct Shot<'a> {
     /// The camera, with the size of the picture.
     pub camera: Camera,
-    /// How splats are drawn.
     pub settings: &'a Settings,
     /// The model; the left one if there are two.
     pub left: Option<&'a Drawable>,
-    /// The right model.
     pub right: Option<&'a Drawable>,
     /// Start of the right model, as a fraction of the width.
     pub divider: f32,
@@ -58,7 +54,6 @@ pub struct Shot<'a> {
     pub depths: [f32; 2],
 }
 
-/// Pipelines and canvases on one device.
 #[derive(Debug)]
 pub struct Painter {
     gpu: Arc<Gpu>,
@@ -69,12 +64,10 @@ pub struct Painter {
     canvases: Option<Canvases>,
     /// The rasterizer's buffers for a canvas; both sides use them in turn.
     buffers: Option<PictureBuffers>,
-    /// Times of the frames shown.
     pub times: StageTimes,
 }
 
 impl Painter {
-    /// A painter for targets of a format.
     pub fn new(gpu: Arc<Gpu>, format: wgpu::TextureFormat) -> Result<Self> {
         let painter = Self {
             blending: Blending::new(&gpu),
@@ -90,7 +83,6 @@ impl Painter {
         Ok(painter)
     }
 
-    /// Copies a model to the device.
     pub fn upload(&self, file: &SplatFile) -> Result<Drawable> {
         self.blending.upload(&self.gpu, file)
     }
@@ -112,7 +104,6 @@ impl Painter {
         Ok(written)
     }
 
-    /// Timestamps of egui's pass.
     pub fn panel_stamps(&self) -> Option<wgpu::RenderPassTimestampWrites<'_>> {
         self.times.stamps(PANEL).render(0)
     }
@@ -193,7 +184,6 @@ impl Painter {
         Ok(())
     }
 
-    /// Whether the rasterizer is to draw.
     fn rasterizes(&self, settings: &Settings) -> bool {
         settings.display == Display::Splats
             && match settings.drawing {

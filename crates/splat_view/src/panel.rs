@@ -8,7 +8,6 @@ use crate::sources::label;
 use crate::stage_times::{SECOND, STAGES};
 use crate::viewer::{Action, Moving, Viewer};
 
-/// Up axes to choose from.
 const AXES: [(DVec3, &str); 6] = [
     (DVec3::NEG_Y, "-y"),
     (DVec3::Y, "y"),

@@ -14,10 +14,8 @@ const FILE_MAX: u64 = 256 << 20;
 /// Longest side that is read, pixels.
 const SIDE_MAX: usize = 16_384;
 
-/// An 8-bit picture.
 #[derive(Debug, Clone)]
 pub struct Photo {
-    /// Width and height in pixels.
     pub size: [usize; 2],
     /// RGBA, row-major, colors not multiplied by alpha.
     pub rgba: Vec<u8>,
@@ -89,7 +87,6 @@ fn jpeg(bytes: &[u8]) -> JpegDecoder<Cursor<&[u8]>> {
     JpegDecoder::new_with_options(Cursor::new(bytes), options)
 }
 
-/// Reads a photo.
 pub fn read_photo(path: &Path) -> Result<Photo> {
     let bytes = bytes(path)?;
     if !is_png(&bytes) {

@@ -27,12 +27,10 @@ pub struct PictureBuffers {
     bindings: wgpu::BindGroup,
 }
 
-/// The pipeline from the picture to the canvas.
 #[derive(Debug)]
 pub struct Rasterizing(Pipeline);
 
 impl Rasterizing {
-    /// Compiles it.
     pub fn new(gpu: &Gpu) -> Self {
         let stage = wgpu::ShaderStages::FRAGMENT;
         Self(Pipeline::new(

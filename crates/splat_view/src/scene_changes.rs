@@ -115,7 +115,6 @@ impl Session {
         }
     }
 
-    /// Shows newly loaded models.
     pub fn receive(&mut self) {
         self.receive_details();
         while let Some(loaded) = self.loader.next() {
@@ -133,7 +132,6 @@ impl Session {
         });
     }
 
-    /// Shows another model on a side, or none.
     pub fn choose(&mut self, side: usize, path: Option<PathBuf>) {
         self.viewer.chosen[side].clone_from(&path);
         match path {

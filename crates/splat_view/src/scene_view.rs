@@ -40,7 +40,6 @@ pub fn background(arguments: &Arguments, scene: Option<&Path>) -> [f32; 3] {
     said.or_else(|| scene.and_then(background_beside)).unwrap_or_default()
 }
 
-/// The camera that `--camera` names.
 pub fn numbered(cameras: &[CaptureCamera], number: usize) -> Result<&CaptureCamera> {
     cameras.get(number).ok_or_else(|| {
         Error::argument(

@@ -25,13 +25,10 @@ pub fn reason(error: &impl std::fmt::Display) -> String {
     rest.map_or(text.as_str(), |(_, reason)| reason).to_owned()
 }
 
-/// A window and its renderers.
 pub struct Screen {
-    /// The window.
     pub window: Arc<Window>,
     /// The device that the surface belongs to.
     pub gpu: Arc<Gpu>,
-    /// Panel and gestures.
     pub egui: egui::Context,
     surface: wgpu::Surface<'static>,
     config: wgpu::SurfaceConfiguration,
@@ -87,12 +84,10 @@ impl Screen {
         Ok(Self { window, gpu: Arc::new(gpu), egui, surface, config, input, renderer })
     }
 
-    /// Format of the surface's textures.
     pub fn format(&self) -> wgpu::TextureFormat {
         self.config.format
     }
 
-    /// Width and height in pixels.
     pub fn size(&self) -> [u32; 2] {
         [self.config.width, self.config.height]
     }
@@ -126,7 +121,6 @@ impl Screen {
         }
     }
 
-    /// Runs one frame of the interface.
     pub fn run_ui(&mut self, ui: impl FnMut(&mut Ui)) -> Interface {
         let input = self.input.take_egui_input(&self.window);
         let mut output = self.egui.run_ui(input, ui);
@@ -202,7 +196,6 @@ impl Screen {
         uploads
     }
 
-    /// Submits a frame and shows it.
     pub fn show(
         &self,
         texture: wgpu::SurfaceTexture,

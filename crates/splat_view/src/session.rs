@@ -21,7 +21,6 @@ use crate::{gestures, overlay, panel, saving};
 
 /// How often files are checked for changes.
 const POLL: Duration = Duration::from_millis(500);
-/// Width of the panel in points.
 const PANEL_WIDTH: f32 = 250.0;
 
 /// Another thread has something ready.
@@ -30,17 +29,11 @@ pub struct Wake;
 
 /// An open window and all that lives with it. `scene_changes` has the part that loads models.
 pub struct Session {
-    /// The window.
     pub screen: Screen,
-    /// Draws splats.
     pub painter: Painter,
-    /// The displayed state.
     pub viewer: Viewer,
-    /// Reads models in the background.
     pub loader: Loader,
-    /// Wakes the event loop.
     pub proxy: EventLoopProxy<Wake>,
-    /// The command line.
     pub arguments: Arguments,
     /// The photo of a camera, by the camera's number.
     pub photo: Option<(usize, TextureHandle)>,
@@ -53,7 +46,6 @@ pub struct Session {
 }
 
 impl Session {
-    /// A window that shows nothing yet.
     pub fn new(screen: Screen, arguments: Arguments, proxy: EventLoopProxy<Wake>) -> Result<Self> {
         let painter = Painter::new(Arc::clone(&screen.gpu), screen.format())?;
         let mut settings = Settings::default();

@@ -6,12 +6,9 @@ use std::time::SystemTime;
 use splat_render::levels::INDEX;
 use splat_render::{Error, Result};
 
-/// A model that can be shown.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Source {
-    /// Label in the panel.
     pub name: String,
-    /// The file.
     pub path: PathBuf,
     /// The folder that was named, or the one that the file lies in.
     pub folder: PathBuf,
@@ -41,7 +38,6 @@ fn folder_name(folder: &Path) -> String {
         .unwrap_or_else(|| folder.display().to_string())
 }
 
-/// When a file was written, and its length.
 pub type Stamp = (SystemTime, u64);
 
 /// When a file was last written, and its length.

@@ -23,23 +23,15 @@ pub const STAGES: [&str; 14] = [
     "compose",
     "panel",
 ];
-/// Splats are projected to 2D splats.
 pub const PROJECT: usize = 0;
-/// 2D splats are sorted by depth.
 pub const SORT: usize = 1;
-/// The blending unit draws 2D splats onto a canvas.
 pub const BLEND: usize = 2;
-/// Each tile gets its list of splats.
 pub const BIN: usize = 3;
-/// The rasterizer draws its picture.
 pub const RASTERIZE: usize = 4;
-/// That picture is copied onto a canvas.
 pub const CANVAS: usize = 5;
 /// First stage of the second model.
 pub const SECOND: usize = 6;
-/// The canvases are composed into one picture.
 pub const COMPOSE: usize = 12;
-/// egui paints panel and overlays.
 pub const PANEL: usize = 13;
 
 /// Which stages of a frame wrote a timestamp.
@@ -66,7 +58,6 @@ struct Queries {
     set: wgpu::QuerySet,
     resolved: wgpu::Buffer,
     readable: wgpu::Buffer,
-    /// Milliseconds of one tick.
     tick: f64,
     /// Stages of the frame whose times are being read back.
     written: Written,
@@ -82,12 +73,10 @@ pub struct Stamps<'a> {
 }
 
 impl<'a> Stamps<'a> {
-    /// No timestamps.
     pub fn none() -> Self {
         Self { set: None, first: 0 }
     }
 
-    /// Whether passes write any.
     pub fn are_written(&self) -> bool {
         self.set.is_some()
     }
@@ -96,7 +85,6 @@ impl<'a> Stamps<'a> {
         Some((self.first + stage) as u32)
     }
 
-    /// For a compute pass.
     pub fn compute(&self, stage: usize) -> Option<wgpu::ComputePassTimestampWrites<'a>> {
         self.set.map(|query_set| wgpu::ComputePassTimestampWrites {
             query_set,
@@ -105,7 +93,6 @@ impl<'a> Stamps<'a> {
         })
     }
 
-    /// For a render pass.
     pub fn render(&self, stage: usize) -> Option<wgpu::RenderPassTimestampWrites<'a>> {
         self.set.map(|query_set| wgpu::RenderPassTimestampWrites {
             query_set,
@@ -116,7 +103,6 @@ impl<'a> Stamps<'a> {
 }
 
 impl StageTimes {
-    /// Times of frames on this device.
     pub fn new(gpu: &Gpu) -> Self {
         let device = gpu.device();
         let queries =

@@ -30,7 +30,6 @@ impl Streaming {
         Self { views, drawn, last: None }
     }
 
-    /// Sets the camera.
     pub fn look(&mut self, view: View) {
         if self.last != Some(view) {
             self.last = Some(view);

@@ -55,7 +55,6 @@ struct Background {
     background: [f32; 3],
 }
 
-/// A fit's report.
 #[derive(Deserialize)]
 struct FitReport {
     protocol: Background,

@@ -13,13 +13,11 @@ pub const USUAL: DVec3 = DVec3::NEG_Y;
 const CONVENTIONS: [DVec3; 2] = [DVec3::NEG_Y, DVec3::Z];
 /// Splats of a lower opacity logit do not count.
 const FAINT_LOGIT: f32 = 0.0;
-/// Number of splats that are looked at.
 const SAMPLES: usize = 20_000;
 /// A flat splat's shortest axis is at most so long, of the middle one.
 const FLAT: f64 = 0.4;
 /// Cosine of the angle, 12 degrees, within which directions are alike.
 const ALIKE: f64 = 0.978;
-/// Directions that are tried.
 const DIRECTIONS: usize = 1500;
 /// Maximum bonus of a convention's direction.
 const BONUS: f64 = 1.0;
@@ -28,7 +26,6 @@ const MIN_WEIGHT: f64 = 4.0;
 /// Minimum number of splats in a plane.
 const MIN_SPLATS: usize = 20;
 
-/// A splat that is seen.
 struct Flake {
     at: DVec3,
     /// Its shortest axis, or zero if it is not flat.

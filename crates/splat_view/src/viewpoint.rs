@@ -49,12 +49,10 @@ impl Viewpoint {
         Self { position, rotation, distance: ahead.max(0.1 * radius) }
     }
 
-    /// Right axis in the world.
     pub fn right(&self) -> DVec3 {
         self.rotation * DVec3::X
     }
 
-    /// Down axis in the world.
     pub fn down(&self) -> DVec3 {
         self.rotation * DVec3::Y
     }
@@ -79,7 +77,6 @@ impl Viewpoint {
         self.rotation = rotation.normalize();
     }
 
-    /// Orbits about the pivot.
     pub fn orbit(&mut self, yaw: f64, pitch: f64, up: DVec3) {
         let pivot = self.pivot();
         self.turn(yaw, pitch, up);
@@ -103,7 +100,6 @@ impl Viewpoint {
         self.position = target - self.forward() * self.distance;
     }
 
-    /// World to camera.
     pub fn viewmat(&self) -> DMat4 {
         DMat4::from_quat(self.rotation.inverse()) * DMat4::from_translation(-self.position)
     }

@@ -47,13 +47,10 @@ fn no_display() -> String {
     )
 }
 
-/// The program while its event loop runs.
 struct App {
     arguments: Arguments,
-    /// Taken when the window opens.
     start: Option<Start>,
     proxy: EventLoopProxy<Wake>,
-    /// None until the window is open.
     session: Option<Session>,
     /// Why the program ends, if it fails.
     failure: Option<Error>,
