@@ -100,7 +100,6 @@ impl ChunkTiles {
 /// Fewest pairs for which a task of their own pays.
 const GROUP: usize = 1 << 14;
 
-/// Splats sorted into tiles.
 #[derive(Debug, Default)]
 pub(super) struct Bins {
     /// `[tiles + 1]` start of each tile's list.
@@ -254,7 +253,6 @@ fn touched_tiles(splats: &[Option<Splat2d>], width: u32, height: u32) -> Vec<Chu
         .collect()
 }
 
-/// 2D splats, None for those not drawn.
 fn splats2d(projected: &Projected<f32>) -> Vec<Option<Splat2d>> {
     (0..projected.len())
         .map(|i| {

@@ -10,7 +10,6 @@ use crate::stages::SplatParams;
 /// Splats per block: some whole vectors of any width.
 pub(super) const BLOCK: usize = 64;
 
-/// One number of each splat of a block.
 #[derive(Debug, Clone, Copy)]
 #[repr(align(64))]
 pub(super) struct Row(pub [f32; BLOCK]);
@@ -18,7 +17,6 @@ pub(super) struct Row(pub [f32; BLOCK]);
 impl Row {
     pub const ZERO: Self = Self([0.0; BLOCK]);
 
-    /// The vector `at` of the row.
     #[inline(always)]
     pub fn get<S: Simd>(&self, s: S, at: usize) -> Lanes<S> {
         Lanes::new(s, S::as_simd_f32s(&self.0).0[at])
@@ -59,7 +57,6 @@ pub(super) struct Ids {
 impl Ids {
     pub const NONE: Self = Self { ids: [0; BLOCK], len: 0 };
 
-    /// The first `len` splats.
     pub fn all(len: usize) -> Self {
         Self { ids: std::array::from_fn(|k| k as u8), len }
     }
@@ -82,7 +79,6 @@ impl Ids {
         self.len += usize::from(wanted);
     }
 
-    /// The ids below `count`.
     pub fn below(&self, count: usize) -> Self {
         let len = self.get().partition_point(|&k| usize::from(k) < count);
         Self { len, ..*self }
@@ -111,7 +107,6 @@ impl SplatRows {
         opacities: Row::ZERO,
     };
 
-    /// The vector `at` of the quaternions.
     #[inline(always)]
     pub fn quat<S: Simd>(&self, s: S, at: usize) -> [Lanes<S>; 4] {
         let [w, x, y, z] = &self.quats;

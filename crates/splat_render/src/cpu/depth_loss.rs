@@ -14,7 +14,6 @@ const PART: usize = 1 << 14;
 pub(super) struct DepthLoss {
     /// Gradient with respect to the picture's alpha.
     pub v_alpha: Vec<f32>,
-    /// Gradient with respect to the picture's accumulated depth.
     pub v_depth: Vec<f32>,
 }
 

@@ -21,7 +21,6 @@ pub(super) struct Exposed {
 }
 
 impl Exposed {
-    /// Corrects a picture.
     pub fn run(&mut self, image: &Planes, exposure: &Exposure<f32>) {
         let [r, g, b, _, transmittance] = &image.planes;
         let behind = exposure.behind();
@@ -100,7 +99,6 @@ impl Exposed {
     }
 }
 
-/// One channel's exposure.
 #[derive(Clone, Copy)]
 struct Raw {
     gain: f32,

@@ -10,7 +10,6 @@ use pulp::Simd;
 
 use crate::sh::Number;
 
-/// One number per lane.
 #[derive(Clone, Copy)]
 pub(super) struct Lanes<S: Simd> {
     s: S,
@@ -45,7 +44,6 @@ impl<S: Simd> Lanes<S> {
         self.s
     }
 
-    /// The same number in every lane.
     #[inline(always)]
     pub fn all(self, value: f32) -> Self {
         Self::splat(self.s, value)
@@ -209,7 +207,6 @@ impl<S: Simd> Add<f32> for Lanes<S> {
     }
 }
 
-/// One 3-vector per lane.
 #[derive(Clone, Copy)]
 pub(super) struct Vec3s<S: Simd> {
     pub x: Lanes<S>,
@@ -252,7 +249,6 @@ impl<S: Simd> Vec3s<S> {
         }
     }
 
-    /// `self * factor + summand`.
     #[inline(always)]
     pub fn mul_add(self, factor: Lanes<S>, summand: Self) -> Self {
         Self {
@@ -284,7 +280,6 @@ impl<S: Simd> Sub for Vec3s<S> {
     }
 }
 
-/// Component by component.
 impl<S: Simd> Mul for Vec3s<S> {
     type Output = Self;
     #[inline(always)]
@@ -330,7 +325,6 @@ impl<S: Simd> Mat3s<S> {
         ])
     }
 
-    /// The transpose times a vector.
     #[inline(always)]
     pub fn transpose_mul(self, v: Vec3s<S>) -> Vec3s<S> {
         let Self([x, y, z]) = self;

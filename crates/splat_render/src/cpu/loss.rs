@@ -34,7 +34,6 @@ pub(super) struct Loss {
 
 /// A band of rows of one channel.
 struct Band<'a> {
-    /// The picture's channel.
     x: &'a [f32],
     photo: &'a Target,
     channel: usize,
@@ -59,16 +58,12 @@ const MEANS: usize = 4;
 
 /// A band's scratch memory. Rings have all rows of a vector side by side.
 struct Memory<'a, V> {
-    /// Vectors of a row.
     vectors: usize,
-    /// [`PICTURES`] maps.
     pictures: &'a mut [[V; SLOTS]],
-    /// [`SLOPES`] maps.
     slopes: &'a mut [[V; SLOTS]],
     /// [`STEP`] rows of each of [`MEANS`] maps, filtered along the columns, with [`HALF`] vectors
     /// before and after each row.
     filtered: &'a mut [V],
-    /// A row's gradient.
     gradient: &'a mut [V],
     /// A row as it lies in a picture, zero beyond its width.
     row: &'a mut [V],
@@ -135,7 +130,6 @@ impl<'a, V: bytemuck::Pod> Memory<'a, V> {
         spread::<S>(row, &mut ring[at..], PICTURES * SLOTS * S::F32_LANES);
     }
 
-    /// Makes `row` the weights.
     #[inline(always)]
     fn put_weights<S: Simd<f32s = V>>(&mut self) {
         let row = bytemuck::cast_slice::<V, f32>(self.row);
@@ -199,7 +193,6 @@ impl Band<'_> {
         }
     }
 
-    /// Takes in the weights of a row of the picture.
     #[inline(always)]
     fn weigh<S: Simd>(&self, memory: &mut Memory<'_, S::f32s>, row: usize) {
         if let Some(weights) = &self.photo.weights {

@@ -232,7 +232,6 @@ pub(super) fn sh_color<S: Simd>(
     color
 }
 
-/// One visible 2D splat.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Splat2d {
     pub mean: [f32; 2],
@@ -251,7 +250,6 @@ pub(super) struct ProjectBlock {
     /// The projected splats of the block; later arrays are in this order.
     ids: Ids,
     splats: SplatRows,
-    /// Camera-space centers.
     t: [Row; 3],
     means2d: [Row; 2],
     factors: [Row; 3],
@@ -381,7 +379,6 @@ impl WithSimd for Paint<'_> {
 }
 
 impl ProjectBlock {
-    /// Everything but the colors.
     #[inline(always)]
     fn outline<S: Simd>(&mut self, s: S, view: &View, splats: &Splats<S>, at: usize) {
         let g = geometry(s, view, splats);
@@ -413,7 +410,6 @@ impl ProjectBlock {
         self.reaches.set(at, visible.keep(zero.all(1.0)));
     }
 
-    /// Colors of the visible splats.
     #[inline(always)]
     fn paint<S: Simd>(&mut self, s: S, view: &View, colors: Colors<'_, f32>, first: usize) {
         let (places, numbers) = (self.visible.get(), self.numbers);

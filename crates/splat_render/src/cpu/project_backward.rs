@@ -16,7 +16,6 @@ use crate::stages::{
     Colors, ProjectOptions, Projected, ProjectedGradients, SplatGradients, SplatParams,
 };
 
-/// Gradients of one 2D splat.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct V2d {
     pub v_mean: [f32; 2],
@@ -200,7 +199,6 @@ impl BackwardBlock {
         })
     }
 
-    /// Begins a block.
     #[inline(always)]
     pub fn clear(&mut self) {
         self.ids.clear();

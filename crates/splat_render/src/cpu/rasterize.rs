@@ -50,7 +50,6 @@ impl Planes {
 /// A tile's rows in each plane.
 type Rows<'a> = [[&'a mut [f32]; SIDE]; 5];
 
-/// Cuts a row of tiles into its tiles.
 fn tiles(band: [&mut [f32]; 5], width: usize) -> Vec<Rows<'_>> {
     let mut tiles: Vec<Rows<'_>> = Vec::new();
     tiles.resize_with(width.div_ceil(SIDE), Rows::default);

@@ -35,9 +35,7 @@ pub(super) struct PictureGradients<'a> {
     pub image: &'a Planes,
     /// Gradient of each color channel, H x W.
     pub v_color: &'a [Vec<f32>; 3],
-    /// Gradient of alpha, if there is one.
     pub v_alpha: Option<&'a [f32]>,
-    /// Gradient of the accumulated depth, if there is one.
     pub v_depth: Option<&'a [f32]>,
 }
 

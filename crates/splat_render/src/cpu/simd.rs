@@ -115,7 +115,6 @@ mod tests {
 
     type Results = (Image<f32>, ProjectedGradients<f32>, Vec<f32>);
 
-    /// Runs `work` with this many lanes.
     fn at<T: Send>(lanes: usize, work: impl FnOnce() -> T + Send) -> T {
         rayon::ThreadPoolBuilder::new()
             .num_threads(2)

@@ -34,7 +34,6 @@ struct CacheLine([f32; WIDEST]);
 pub(super) struct Aligned(Vec<CacheLine>);
 
 impl Aligned {
-    /// `count` vectors with arbitrary contents.
     pub fn vectors<S: Simd>(&mut self, count: usize) -> &mut [S::f32s] {
         let lines = (count * S::F32_LANES).div_ceil(WIDEST);
         if self.0.len() < lines {

@@ -33,13 +33,11 @@ const fn block_width(lanes: usize) -> usize {
     if lanes < 4 { 1 } else { 4 }
 }
 
-/// Rows of a block.
 #[inline(always)]
 const fn block_height(lanes: usize) -> usize {
     lanes / block_width(lanes)
 }
 
-/// Blocks side by side in a tile.
 #[inline(always)]
 const fn blocks_across(lanes: usize) -> usize {
     SIDE / block_width(lanes)

@@ -22,11 +22,8 @@ const COLOR_FLOATS_PER_GROUP: u32 = 256;
 /// Splats under optimization, on the device.
 #[derive(Debug)]
 pub(super) struct AdamBuffers {
-    /// Parameters.
     pub splats: SplatBuffers,
-    /// First moments.
     pub first: SplatBuffers,
-    /// Second moments.
     pub second: SplatBuffers,
     /// `[N * NOTES]`
     pub notes: wgpu::Buffer,

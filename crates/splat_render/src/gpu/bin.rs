@@ -46,14 +46,12 @@ pub(super) struct PairBins {
 #[derive(Debug)]
 pub(super) struct TileChunk {
     pub chunk: Chunk,
-    /// `chunk` as the kernels read it.
     pub uniform: wgpu::Buffer,
     /// The same for each dispatch of the rasterize kernels, which walk a part of all lists each.
     pub passes: Vec<wgpu::Buffer>,
 }
 
 impl TileChunk {
-    /// Of the given tiles.
     pub fn new(gpu: &Gpu, chunk: Chunk) -> Self {
         let chunk = Chunk { groups_max: gpu.groups_max, ..chunk };
         // A splat is in a tile's list once at most.
@@ -68,13 +66,11 @@ impl TileChunk {
         Self { chunk, uniform: gpu.uniform(&chunk), passes }
     }
 
-    /// Number of tiles.
     pub fn tiles(&self) -> u32 {
         self.chunk.tile_end - self.chunk.tile_begin
     }
 }
 
-/// Tiles of a picture.
 pub(super) fn tile_count(width: u32, height: u32) -> u32 {
     width.div_ceil(TILE) * height.div_ceil(TILE)
 }
@@ -85,7 +81,6 @@ pub(super) fn pair_limit(gpu: &Gpu, slot_floats: usize) -> u32 {
 }
 
 impl SplatBins {
-    /// For `splats` splats and `chunks` chunks.
     pub fn new(gpu: &Gpu, splats: u32, chunks: u32) -> Result<Self> {
         let words = |n: u32| u64::from(n) * 4;
         let pair = |label| -> Result<[wgpu::Buffer; 2]> {
@@ -321,7 +316,6 @@ fn sort_passes(tiles: u32, digit_bits: u32) -> u32 {
 }
 
 impl PairBins {
-    /// For at most `capacity` pairs and `tiles` tiles in a chunk.
     pub fn new(gpu: &Gpu, capacity: u32, tiles: u32) -> Result<Self> {
         let words = |n: u32| u64::from(n) * 4;
         let buffer = |label| gpu.bindable(label, words(capacity));

@@ -39,10 +39,8 @@ pub(super) struct Compared<'a> {
 }
 
 impl DepthBuffers {
-    /// Bytes of [`Self::sums`].
     pub const SUM_BYTES: u64 = DEPTH_GROUPS as u64 * 4;
 
-    /// Buffers for `pixels` pixels.
     pub fn new(gpu: &Gpu, pixels: u64) -> Result<Self> {
         Ok(Self {
             photo: gpu.bindable("depths of a photo", 8 * pixels)?,

@@ -15,7 +15,6 @@ const BOUNDS_GROUPS: u32 = 64;
 /// Floats per workgroup of density_rows.
 const ROW_FLOATS_PER_GROUP: u32 = 256;
 
-/// A scan.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub(super) struct Scan {
@@ -54,7 +53,6 @@ pub(super) enum RowKind {
     Moments = 2,
 }
 
-/// A buffer of whole numbers.
 pub(super) fn words(gpu: &Gpu, label: &str, count: u32) -> Result<wgpu::Buffer> {
     gpu.bindable(label, 4 * u64::from(count))
 }
@@ -107,7 +105,6 @@ pub(super) struct Drawn {
     pub geometry: wgpu::Buffer,
     /// `[N after]` twice the row of a splat's colors and moments, plus 1 if its moments are zero.
     pub rows: wgpu::Buffer,
-    /// Splats after the run.
     pub splats: u32,
     pub cells: Cells,
 }

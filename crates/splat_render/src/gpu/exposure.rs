@@ -34,10 +34,8 @@ pub(super) struct Exposed<'a> {
 }
 
 impl ExposureBuffers {
-    /// Bytes of [`Self::sums`].
     pub const SUM_BYTES: u64 = EXPOSURE_GROUPS as u64 * SUMS as u64 * 4;
 
-    /// Buffers for `pixels` pixels.
     pub fn new(gpu: &Gpu, pixels: u64) -> Result<Self> {
         Ok(Self {
             corrected: gpu.bindable("corrected picture", 16 * pixels)?,
@@ -58,7 +56,6 @@ impl ExposureBuffers {
         gpu.op(kernel, &bindings, [EXPOSURE_GROUPS, 1])
     }
 
-    /// Corrects the picture.
     pub fn forward(&self, gpu: &Gpu, of: Exposed<'_>) -> Op {
         self.op(gpu, Kernel::Exposure, of)
     }

@@ -93,7 +93,6 @@ impl View {
         }
     }
 
-    /// Camera and background alone.
     pub fn of_view(camera: &Camera, options: &ProjectOptions, background: [f32; 3]) -> Self {
         let row = |i: usize| camera.viewmat.row(i).to_array().map(|v| v as f32);
         Self {
@@ -111,7 +110,6 @@ impl View {
     }
 }
 
-/// The splats of one dispatch.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 pub(super) struct Window {
@@ -166,7 +164,6 @@ impl Chunk {
     }
 }
 
-/// One pass of the radix sort.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 pub(super) struct SortPass {
@@ -217,7 +214,6 @@ pub(super) struct DepthStep {
     pub scale: f32,
 }
 
-/// A photo's exposure.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub(super) struct ExposureUniform {

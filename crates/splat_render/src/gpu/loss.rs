@@ -35,14 +35,11 @@ pub(super) struct LossBuffers {
     pub totals: wgpu::Buffer,
     /// `[parts * 2]` weighted sums of SSIM and of |x - y|.
     pub sums: wgpu::Buffer,
-    /// Width and height.
     size: [u32; 2],
-    /// Entries of `sums`.
     parts: u32,
 }
 
 impl LossBuffers {
-    /// For pictures of one size.
     pub fn new(gpu: &Gpu, width: u32, height: u32) -> Result<Self> {
         let pixels = u64::from(width) * u64::from(height);
         let (parts, planes) = if gpu.loss_by_lines() {
@@ -62,7 +59,6 @@ impl LossBuffers {
         })
     }
 
-    /// Bytes of [`Self::sums`].
     pub fn sum_bytes(&self) -> u64 {
         8 * u64::from(self.parts)
     }
@@ -78,7 +74,6 @@ impl LossBuffers {
         total
     }
 
-    /// All passes.
     pub fn ops(
         &self,
         gpu: &Gpu,

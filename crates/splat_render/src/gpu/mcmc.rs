@@ -12,7 +12,6 @@ use super::layout::GEOMETRY;
 use crate::error::Result;
 use crate::fit_device::{FogCamera, McmcRun, sampled_every, share_table, weight_table};
 
-/// Uniforms of a round.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub(super) struct Run {

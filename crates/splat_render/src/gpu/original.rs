@@ -14,7 +14,6 @@ use super::project::{count, window_uniform};
 use crate::error::Result;
 use crate::fit_device::OriginalRun;
 
-/// Uniforms of a run.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub(super) struct RunUniform {

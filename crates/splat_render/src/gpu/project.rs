@@ -12,9 +12,7 @@ use crate::stages::{Colors, ProjectOptions, Projected, SplatParams};
 /// Splat parameters on the device.
 #[derive(Debug)]
 pub(super) struct SplatBuffers {
-    /// Number of splats.
     pub splats: u32,
-    /// Floats of color per splat.
     pub color_floats: u64,
     /// `[N * GEOMETRY]`
     pub geometry: wgpu::Buffer,
@@ -42,7 +40,6 @@ pub(super) fn count(splats: usize) -> Result<u32> {
     })
 }
 
-/// Rows of the geometry buffer.
 pub(super) fn geometry_rows(splats: &SplatParams<'_, f32>) -> Vec<[f32; GEOMETRY]> {
     (0..splats.len())
         .map(|i| {
@@ -57,7 +54,6 @@ pub(super) fn geometry_rows(splats: &SplatParams<'_, f32>) -> Vec<[f32; GEOMETRY
 }
 
 impl SplatBuffers {
-    /// Copies the parameters to the device.
     pub fn upload(gpu: &Gpu, splats: &SplatParams<'_, f32>) -> Result<Self> {
         let (stride, colors) = match splats.colors {
             Colors::Direct(colors) => (1, colors),

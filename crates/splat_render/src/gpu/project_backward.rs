@@ -49,7 +49,6 @@ pub(super) fn camera_buffer(gpu: &Gpu, splats: u32) -> Result<wgpu::Buffer> {
 }
 
 impl GradientBuffers {
-    /// For these splats.
     pub fn new(gpu: &Gpu, splats: &SplatBuffers) -> Result<Self> {
         let n = u64::from(splats.splats);
         Ok(Self {
@@ -79,7 +78,6 @@ impl GradientBuffers {
     }
 }
 
-/// Differentiates the projection of all splats.
 pub(super) fn project_backward_ops(
     gpu: &Gpu,
     drawn: Projection<'_>,
@@ -110,7 +108,6 @@ pub(super) fn project_backward_ops(
     ops
 }
 
-/// Rows of a 2D gradient buffer.
 fn gradient_rows(v: &ProjectedGradients<f32>) -> Vec<[f32; GRADIENT]> {
     (0..v.v_means2d.len())
         .map(|i| {

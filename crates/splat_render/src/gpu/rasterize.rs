@@ -72,7 +72,6 @@ impl Binned {
         Projection { view: &self.view, splats2d: &self.splats2d }
     }
 
-    /// Fills the pair lists for a chunk.
     pub fn chunk_ops(&self, gpu: &Gpu, chunk: &TileChunk) -> Vec<Op> {
         let mut ops = self.bins.count_ops(gpu, self.projection(), chunk);
         ops.extend(self.bins.pair_ops(gpu, self.projection(), chunk, &self.pairs));
@@ -80,7 +79,6 @@ impl Binned {
     }
 }
 
-/// A picture on the device.
 #[derive(Debug)]
 pub(super) struct PictureBuffers {
     /// `[H * W]` color and final transmittance.
@@ -90,7 +88,6 @@ pub(super) struct PictureBuffers {
 }
 
 impl PictureBuffers {
-    /// Buffers for `pixels` pixels.
     pub fn new(gpu: &Gpu, pixels: u64) -> Result<Self> {
         Ok(Self {
             picture: gpu.bindable("picture", 16 * pixels)?,

@@ -22,7 +22,6 @@ use crate::splats::SplatArrays;
 const CHUNK: usize = 256;
 /// SH coefficients are in plus or minus half of this.
 const SH_RANGE: f64 = 8.0;
-/// Highest SH degree of the format.
 const SH_DEGREE: u32 = 3;
 /// Maximum magnitude of a log-scale in the bounds, as clamped by the format's own writers.
 const SCALE_MAX: f32 = 20.0;

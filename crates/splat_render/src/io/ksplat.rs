@@ -16,7 +16,6 @@ use crate::splats::SplatArrays;
 
 const HEADER: usize = 4096;
 const SECTION_HEADER: usize = 1024;
-/// Highest SH degree of the format.
 const SH_DEGREE: u32 = 2;
 /// Half the range of level 2's SH bytes if the header gives none.
 const SH_HALF_RANGE: f32 = 1.5;
@@ -38,11 +37,9 @@ const LEVELS: [Level; 3] = [
     Level { scale: 6, rotation: 12, color: 20, sh: 24, sh_bytes: 1 },
 ];
 
-/// One section of the file.
 struct Section<'a> {
     count: usize,
     degree: u32,
-    /// Bytes per splat.
     stride: usize,
     rows: &'a [u8],
     /// Splats per full bucket, and the number of full buckets; the sizes of partial buckets follow.
@@ -57,7 +54,6 @@ struct Section<'a> {
     steps: f32,
 }
 
-/// Reads a whole file.
 pub fn parse(bytes: &[u8], named: &Named<'_>) -> Result<Loaded> {
     let mut data = Bytes::new(bytes, named);
     let header = data.take(HEADER, "header")?;

@@ -16,9 +16,7 @@ use crate::splats::SplatArrays;
 
 /// Columns of a splat's numbers in the rows of a `.ply`.
 pub struct Rows {
-    /// Number of splats.
     pub count: usize,
-    /// SH degree.
     pub degree: u32,
     xyz: Vec<usize>,
     quat: Vec<usize>,

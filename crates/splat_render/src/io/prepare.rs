@@ -10,13 +10,9 @@ use crate::splats::SplatArrays;
 
 /// Capabilities of a format.
 pub struct Room {
-    /// Its name in messages.
     pub name: &'static str,
-    /// Highest SH degree.
     pub sh_degree: u32,
-    /// Whether it holds the f64 origin.
     pub origin: bool,
-    /// Whether it holds the antialiased flag.
     pub antialiased: bool,
 }
 

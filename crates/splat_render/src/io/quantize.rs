@@ -6,7 +6,6 @@ use crate::sh::C0;
 /// and the written value lies within half a step of them.
 const OPACITY_END: f64 = 0.25 / 255.0;
 
-/// 1 / (1 + exp(-x)).
 pub fn sigmoid(logit: f32) -> f64 {
     1.0 / (1.0 + (-f64::from(logit)).exp())
 }
@@ -74,7 +73,6 @@ impl SmallestThree {
         Self { largest, others: std::array::from_fn(|_| others.next().unwrap_or(0.0)) }
     }
 
-    /// The unit quaternion.
     pub fn quat(&self) -> [f64; 4] {
         let rest = 1.0 - self.others.iter().map(|c| c * c).sum::<f64>();
         let mut others = self.others.iter();
@@ -88,12 +86,10 @@ impl SmallestThree {
     }
 }
 
-/// `x` as f32.
 pub fn to_f32<const N: usize>(x: [f64; N]) -> [f32; N] {
     x.map(|c| c as f32)
 }
 
-/// `x` as f64.
 pub fn to_f64<const N: usize>(x: [f32; N]) -> [f64; N] {
     x.map(f64::from)
 }

@@ -9,11 +9,9 @@ use super::{Format, Loaded, SplatFile};
 use crate::error::Result;
 use crate::splats::SplatArrays;
 
-/// Bytes per splat.
 const ROW: usize = 32;
 const ROOM: Room = Room { name: ".splat", sh_degree: 0, origin: false, antialiased: false };
 
-/// Reads a whole file.
 pub fn parse(bytes: &[u8], named: &Named<'_>) -> Result<Loaded> {
     let (rows, rest) = bytes.as_chunks::<ROW>();
     if !rest.is_empty() {
@@ -47,7 +45,6 @@ pub fn linear_scale(log: f32) -> f32 {
     f64::from(log).exp().min(f64::from(f32::MAX)) as f32
 }
 
-/// The whole file.
 pub fn encode(file: &SplatFile, notes: &mut Vec<String>) -> Result<Vec<u8>> {
     let splats = prepare(file, &ROOM, notes);
     if splats.is_empty() {

@@ -90,7 +90,6 @@ impl Header {
     }
 }
 
-/// Reads a whole file.
 pub fn parse(bytes: &[u8], named: &Named<'_>) -> Result<Loaded> {
     let (header, data) =
         if bytes.starts_with(MAGIC) { open_4(bytes, named)? } else { open_gzip(bytes, named)? };

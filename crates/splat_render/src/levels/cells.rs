@@ -1,16 +1,17 @@
 //! Space in cells of about equally many splats: a tree of planes across the axes.
 
-/// A part of space.
 pub enum Node {
     /// Splits at a plane across an axis: below it and the rest.
-    Split { axis: usize, at: f32, halves: [usize; 2] },
-    /// A cell, by its number.
+    Split {
+        axis: usize,
+        at: f32,
+        halves: [usize; 2],
+    },
     Cell(usize),
 }
 
 /// The tree; its root comes first.
 pub struct Cells {
-    /// All nodes.
     pub nodes: Vec<Node>,
     /// Number of cells, which are numbered along the tree: neighbors have near numbers.
     pub count: usize,

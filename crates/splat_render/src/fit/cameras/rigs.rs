@@ -13,7 +13,6 @@ use crate::error::{Error, Result};
 /// the origin, or from each other's scene.
 const ONE_CENTER: f64 = 1e-5;
 
-/// Which cameras move as one.
 #[derive(Debug, Clone)]
 pub(super) struct Rigs {
     /// The first camera of each camera's rig.
@@ -48,7 +47,6 @@ impl Rigs {
         Ok(rigs)
     }
 
-    /// Whether any camera is of a rig.
     pub(super) fn any(&self) -> bool {
         self.first.iter().enumerate().any(|(k, &first)| first != k)
     }

@@ -23,7 +23,6 @@ fn ready<T>(future: impl Future<Output = T>) -> T {
     }
 }
 
-/// Real GPUs first.
 fn rank(kind: wgpu::DeviceType) -> u32 {
     match kind {
         wgpu::DeviceType::DiscreteGpu => 0,

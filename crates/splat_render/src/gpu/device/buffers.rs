@@ -48,7 +48,6 @@ impl Gpu {
         Ok(buffer)
     }
 
-    /// Checks that a buffer can be bound whole.
     pub(in crate::gpu) fn bindable_bytes(&self, label: &str, bytes: u64) -> Result<()> {
         if bytes > self.binding_limit {
             return Err(self.error(&format!(
@@ -59,7 +58,6 @@ impl Gpu {
         Ok(())
     }
 
-    /// A buffer that must be bound whole.
     pub(in crate::gpu) fn bindable(&self, label: &str, bytes: u64) -> Result<wgpu::Buffer> {
         self.bindable_bytes(label, bytes)?;
         self.buffer(label, bytes)
@@ -71,7 +69,6 @@ impl Gpu {
         self.bindable("transmittances", 4 * floats)
     }
 
-    /// A buffer with the given contents.
     pub(in crate::gpu) fn upload<T: bytemuck::NoUninit>(
         &self,
         label: &str,
@@ -86,7 +83,6 @@ impl Gpu {
         Ok(buffer)
     }
 
-    /// Overwrites a part of a buffer.
     pub(in crate::gpu) fn write(&self, buffer: &wgpu::Buffer, offset: u64, bytes: &[u8]) {
         self.count_host(bytes.len() as u64);
         if !self.plans_only {
@@ -94,7 +90,6 @@ impl Gpu {
         }
     }
 
-    /// A uniform buffer with the given contents.
     pub(in crate::gpu) fn uniform<T: bytemuck::NoUninit>(&self, contents: &T) -> wgpu::Buffer {
         let size = size_of::<T>().next_multiple_of(16) as u64;
         self.count(size);

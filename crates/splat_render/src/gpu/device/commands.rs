@@ -10,7 +10,6 @@ use crate::error::Result;
 use crate::gpu::kernels::{Access, Kernel, Source};
 use crate::gpu::layout::SPLATS_PER_GROUP;
 
-/// A binding of a kernel.
 #[derive(Debug, Clone)]
 pub(in crate::gpu) struct Bound<'a> {
     buffer: &'a wgpu::Buffer,
@@ -30,7 +29,6 @@ impl<'a> Bound<'a> {
     }
 }
 
-/// How many workgroups a dispatch has.
 #[derive(Debug, Clone)]
 pub(in crate::gpu) enum Groups {
     /// Known when the dispatch is prepared.
@@ -45,17 +43,14 @@ impl From<[u32; 2]> for Groups {
     }
 }
 
-/// One prepared command.
 #[derive(Debug, Clone)]
 pub(in crate::gpu) enum Op {
-    /// Runs a kernel.
     Dispatch {
         kernel: Kernel,
         /// None if work is only planned.
         run: Option<(wgpu::ComputePipeline, wgpu::BindGroup)>,
         groups: Groups,
     },
-    /// Fills a buffer with zeros.
     Clear(wgpu::Buffer),
     /// Copies this many bytes (the last field) from the start of the first buffer to an offset in the
     /// second.
@@ -155,7 +150,6 @@ impl Gpu {
         (0..splats).step_by(step as usize).map(|b| b..(b + step).min(splats)).collect()
     }
 
-    /// Records prepared commands in order.
     pub(in crate::gpu) fn record(encoder: &mut wgpu::CommandEncoder, ops: &[Op]) {
         let mut rest = ops;
         while let Some(first) = rest.first() {

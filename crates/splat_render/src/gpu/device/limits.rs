@@ -19,7 +19,6 @@ pub fn needed_limits() -> wgpu::Limits {
     }
 }
 
-/// Checks that an adapter can run the kernels.
 pub(super) fn check_limits(name: &str, offered: &wgpu::Limits) -> Result<()> {
     let mut short = Vec::new();
     needed_limits().check_limits_with_fail_fn(offered, false, |limit, needed, has| {

@@ -32,7 +32,6 @@ pub struct Gpu {
     failure: Arc<Mutex<Option<String>>>,
     /// Why the device was lost, after which nothing works on it.
     lost: Arc<OnceLock<String>>,
-    /// Faults injected by tests.
     injected: Injected,
     /// Number of submissions until one fails, including it; 0 if none will.
     submissions_left: AtomicU64,
@@ -40,13 +39,11 @@ pub struct Gpu {
     plans_only: bool,
     /// Buffers, bind groups and pipelines made so far, and the buffers' bytes.
     made: [AtomicU64; 2],
-    /// Bytes that went between host and device so far.
     host_bytes: AtomicU64,
     /// Most bytes that a storage binding may have.
     pub(super) binding_limit: u64,
     /// Most workgroups in one dimension of a dispatch.
     pub(super) groups_max: u32,
-    /// Build parameters of the shaders.
     build: Build,
     /// Pairs of a tile that one dispatch of the rasterize kernels walks.
     pub(super) list_limit: u32,
@@ -114,17 +111,14 @@ impl Gpu {
         self
     }
 
-    /// Workgroups that scans and sorts are cut into.
     pub(super) fn segments(&self) -> u32 {
         self.build.segments
     }
 
-    /// Bits that one pass of the radix sort takes.
     pub(super) fn digit_bits(&self) -> u32 {
         self.build.digit_bits
     }
 
-    /// Whether the loss goes along whole rows and columns.
     pub(super) fn loss_by_lines(&self) -> bool {
         self.build.loss_by_lines
     }
@@ -218,7 +212,6 @@ impl Gpu {
         self.made[1].fetch_add(bytes, Ordering::Relaxed);
     }
 
-    /// The error for a device that fails while running.
     fn error(&self, what: &str) -> Error {
         let name = &self.info.name;
         Error::Device(match self.lost.get() {

@@ -79,7 +79,6 @@ pub struct GpuFit {
     last: Option<(usize, f32, bool)>,
 }
 
-/// A photo on the device.
 #[derive(Debug)]
 struct Photo {
     frame: usize,
@@ -89,7 +88,6 @@ struct Photo {
     depth: Option<PhotoDepth>,
 }
 
-/// A photo's depths on the device.
 #[derive(Debug)]
 struct PhotoDepth {
     rows: wgpu::Buffer,

@@ -21,7 +21,6 @@ pub(super) struct Scene {
     pub sh_degree: u32,
     pub splats2d: wgpu::Buffer,
     pub v_splats2d: wgpu::Buffer,
-    /// Sums of the camera's gradients.
     pub v_camera: wgpu::Buffer,
     /// The camera sums of each pending step; None until a step is to have them.
     pub pending_cameras: Option<wgpu::Buffer>,
@@ -65,7 +64,6 @@ impl Scene {
         Self::new(gpu, adam, state.splats.sh_degree, tiles, capacity, chunks)
     }
 
-    /// Around these splats.
     pub fn new(
         gpu: &Gpu,
         adam: AdamBuffers,
@@ -167,12 +165,10 @@ impl Scene {
         }
     }
 
-    /// Number of splats.
     pub fn len(&self) -> u32 {
         self.adam.splats.splats
     }
 
-    /// Size of one step's camera sums.
     pub fn camera_bytes(&self) -> u64 {
         u64::from(camera_sums(self.len())) * CAMERA as u64 * 4
     }

@@ -29,7 +29,6 @@ pub(super) struct Build {
     pub rows: u32,
     /// Whether a tile's threads are one subgroup and share data through it.
     pub subgroups: bool,
-    /// Bits per pass of the radix sort.
     pub digit_bits: u32,
     /// Whether each thread of the loss filters a whole row or column.
     pub loss_by_lines: bool,
@@ -46,7 +45,6 @@ impl Build {
         Self { rows: 8, subgroups: false, digit_bits: 4, loss_by_lines: true, segments: 16 },
     ];
 
-    /// Threads of a tile.
     pub const fn threads(self) -> u32 {
         TILE * TILE / 4 / self.rows
     }
@@ -140,7 +138,6 @@ impl Source {
         Self { segmented: true, ..self }
     }
 
-    /// The whole text that is compiled.
     pub fn text(&self, build: Build) -> String {
         let mut text = constants(build.rows);
         if let Some(texts) = self.tile_work {
@@ -153,7 +150,6 @@ impl Source {
         text
     }
 
-    /// Values of the overrides.
     pub fn constants(&self, build: Build) -> Vec<(&'static str, f64)> {
         if self.segmented { vec![("SEGMENTS", f64::from(build.segments))] } else { Vec::new() }
     }

@@ -51,7 +51,6 @@ impl Component {
 
 /// An accessor whose numbers are all within its buffer.
 pub struct Accessor<'a> {
-    /// Rows.
     pub count: usize,
     bytes: &'a [u8],
     stride: usize,
@@ -94,7 +93,6 @@ impl<'a> Accessor<'a> {
         Ok(Self { count, bytes, stride, component, normalized })
     }
 
-    /// Row `i`.
     pub fn row<const N: usize>(&self, i: usize) -> [f32; N] {
         let start = i * self.stride;
         std::array::from_fn(|k| {

@@ -18,7 +18,6 @@ const VALUES_MAX: usize = 1 << 18;
 
 /// A file's JSON and buffers.
 pub struct Document<'a> {
-    /// The JSON.
     pub json: Value,
     /// Place in `stores` of each buffer's bytes.
     buffers: Vec<usize>,
@@ -55,7 +54,6 @@ impl<'a> Document<'a> {
         self.stores.iter().map(|store| store.len()).sum()
     }
 
-    /// An error about this file.
     pub fn bad(&self, reason: impl Into<String>) -> crate::Error {
         self.named.bad(reason)
     }
@@ -162,7 +160,6 @@ fn values(text: &[u8]) -> usize {
     count
 }
 
-/// The JSON and, if any, the binary chunk of a `.glb`.
 fn split_glb<'a>(bytes: &'a [u8], named: &Named<'a>) -> Result<(&'a [u8], Option<&'a [u8]>)> {
     let mut rest = Bytes::new(bytes, named);
     let header = rest.take(12, "header")?;

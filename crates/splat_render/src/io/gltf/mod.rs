@@ -17,7 +17,6 @@ const EXTENSION: &str = "KHR_gaussian_splatting";
 const ROTATION: &str = "KHR_gaussian_splatting:ROTATION";
 const SCALE: &str = "KHR_gaussian_splatting:SCALE";
 const OPACITY: &str = "KHR_gaussian_splatting:OPACITY";
-/// Highest SH degree of the format.
 const SH_DEGREE: u32 = 3;
 /// The only kernel that splats here have.
 const KERNEL: &str = "ellipse";

@@ -10,15 +10,10 @@ use crate::error::Result;
 /// matrices are off by less.
 const SHAPE_TOLERANCE: f64 = 1e-4;
 
-/// A mesh at a place.
 pub struct Placed {
-    /// Its index.
     pub mesh: usize,
-    /// The turn, if any.
     pub rotation: Option<DQuat>,
-    /// The uniform scale.
     pub scale: f64,
-    /// The shift.
     pub translation: DVec3,
 }
 

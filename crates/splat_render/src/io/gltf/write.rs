@@ -75,7 +75,6 @@ impl Attributes {
     }
 }
 
-/// The whole file.
 pub fn encode(file: &SplatFile, format: Format, notes: &mut Vec<String>) -> Result<Vec<u8>> {
     let mut splats = prepare(file, &ROOM, notes).into_owned();
     frame::turn(&mut splats);

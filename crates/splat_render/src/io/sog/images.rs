@@ -28,14 +28,12 @@ enum Place<'a> {
     Folder(PathBuf),
 }
 
-/// The files of a SOG.
 pub struct Bundle<'a> {
     place: Place<'a>,
     named: Named<'a>,
 }
 
 impl<'a> Bundle<'a> {
-    /// Opens the zip in `bytes`.
     pub fn open(bytes: &'a [u8], named: &Named<'a>) -> Result<Self> {
         let zip = ZipArchive::new(Cursor::new(bytes)).map_err(|e| {
             named.bad(format!("cannot be opened as the zip that a .sog is ({e}); copy it again"))
@@ -49,7 +47,6 @@ impl<'a> Bundle<'a> {
         Self { place: Place::Folder(folder), named: *named }
     }
 
-    /// The text of `meta.json`.
     pub fn meta(&mut self) -> Result<Vec<u8>> {
         self.file(META, META_MAX)
     }
@@ -123,9 +120,7 @@ fn unreadable(named: &Named<'_>, name: &str, why: &dyn std::fmt::Display) -> Err
     named.bad(format!("has no readable '{name}' in it ({why}); export it again"))
 }
 
-/// Pixels.
 pub struct Image {
-    /// Pixels per row.
     pub width: usize,
     /// All pixels, the top row first.
     pub rgba: Vec<[u8; 4]>,

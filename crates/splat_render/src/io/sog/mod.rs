@@ -19,7 +19,6 @@ pub use write::{encode, write_folder};
 const CODES: usize = 256;
 /// Palette rows in a row of the image of the palette.
 const PALETTE_COLUMNS: usize = 64;
-/// Highest SH degree of the format.
 const SH_DEGREE: u32 = 3;
 /// The alpha byte of a rotation whose component 0 (w) is left out.
 const ROTATION_TAG: u8 = 252;

@@ -10,7 +10,6 @@ use crate::io::quantize::{SmallestThree, logit_of_byte, to_f32};
 use crate::io::{Format, Loaded, SplatFile};
 use crate::splats::SplatArrays;
 
-/// Reads a whole file.
 pub fn parse(bytes: &[u8], named: &Named<'_>) -> Result<Loaded> {
     let mut bundle = Bundle::open(bytes, named)?;
     let meta = Meta::read(&bundle.meta()?, named)?;
