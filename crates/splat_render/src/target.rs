@@ -91,9 +91,6 @@ impl Weight {
 
 impl Target {
     /// Checks sizes and values; `index` names the photo in the error.
-    ///
-    /// # Errors
-    /// [`Error::Argument`] that names `images[index]`.
     pub fn validate(&self, index: usize) -> Result<()> {
         let pixels = self.width as usize * self.height as usize;
         let bad = |reason: String| Err(Error::argument(format!("images[{index}]"), reason));

@@ -88,10 +88,6 @@ impl Exposures {
     /// A poor render makes gains seem lower than they are, so known values are more reliable at first.
     /// Each initial value has a pull: this times half the squared distance of log gains and offsets is
     /// added to the loss.
-    ///
-    /// # Errors
-    ///
-    /// [`Error::Argument`] unless each photo has one usable initial exposure and pull.
     pub fn start(&mut self, start: &[Option<Exposure<f64>>], pulls: &[f64]) -> Result<()> {
         let count = self.is_fitted.len();
         if start.len() != count || pulls.len() != count {

@@ -277,10 +277,6 @@ impl Fitter {
     }
 
     /// Sets the initial exposures; see [`Exposures::start`]. Call it before any step.
-    ///
-    /// # Errors
-    ///
-    /// [`Error::Argument`] if exposures are not fitted or a value cannot be used.
     pub fn start_exposures(
         &mut self,
         start: &[Option<Exposure<f64>>],

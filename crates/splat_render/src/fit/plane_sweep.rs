@@ -50,9 +50,6 @@ pub struct Sweep {
 }
 
 /// The depth map of each sweep's photo. The same on any number of threads.
-///
-/// # Errors
-/// [`Error::Argument`] if a photo, an index or a range cannot be used.
 pub fn plane_sweep(photos: &[GrayPhoto], sweeps: &[Sweep]) -> Result<Vec<DepthMap>> {
     for (k, photo) in photos.iter().enumerate() {
         photo.camera.validate()?;

@@ -94,10 +94,6 @@ pub struct StepInput {
 
 impl StepInput {
     /// Checks the settings against the sizes of the device's photos, `(width, height)` in pixels.
-    ///
-    /// # Errors
-    ///
-    /// [`Error::Argument`] that names the field.
     pub fn validate(&self, sizes: impl ExactSizeIterator<Item = (u32, u32)>) -> Result<()> {
         let (count, mut sizes) = (sizes.len(), sizes);
         let Some((width, height)) = sizes.nth(self.view) else {

@@ -81,9 +81,6 @@ impl ResidentSplats {
 
     /// Records the project stage and the sort by depth, each a pass with its timestamps. One view per
     /// submission: the last one given counts for all of it.
-    ///
-    /// # Errors
-    /// [`crate::Error::Argument`] if camera or options cannot be used.
     pub fn record(
         &self,
         gpu: &Gpu,

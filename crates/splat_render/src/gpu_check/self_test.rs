@@ -34,10 +34,6 @@ type Outputs = Vec<(&'static str, Vec<f64>)>;
 
 /// Compiles every kernel and compares the stages on a small scene with the reference, and a step and runs
 /// of density control of a fit with the CPU's.
-///
-/// # Errors
-///
-/// [`Error::Device`] with the driver's message or the name of the first wrong stage.
 pub fn self_test(gpu: &Arc<Gpu>) -> Result<()> {
     gpu.compile_all()?;
     let mut outputs = all_stages::<f32>(&**gpu)?;

@@ -17,19 +17,11 @@ const VARIABLE: &str = "IGSR_GPU_CACHE";
 
 /// [`Gpu::new`], with a device that passes [`self_test`] now or passed it before with the same driver and
 /// kernels.
-///
-/// # Errors
-///
-/// As [`Gpu::new`] and [`self_test`].
 pub fn open_tested(software_allowed: bool) -> Result<Arc<Gpu>> {
     open_tested_with(software_allowed, &Injected::default())
 }
 
 /// [`open_tested`] on an adapter with these faults.
-///
-/// # Errors
-///
-/// As [`open_tested`].
 pub fn open_tested_with(software_allowed: bool, injected: &Injected) -> Result<Arc<Gpu>> {
     let gpu = Arc::new(Gpu::with_faults(software_allowed, injected)?);
     let verdict = verdict_file(&gpu).filter(|_| injected.is_sound());

@@ -37,10 +37,6 @@ pub fn write_exr(path: &Path, picture: &ExrPicture<'_>) -> Result<()> {
 }
 
 /// The bytes of such a file.
-///
-/// # Errors
-///
-/// [`Error::Argument`] unless every array has `width * height` entries and there is a pixel.
 pub fn encode_exr(picture: &ExrPicture<'_>) -> Result<Vec<u8>> {
     let ExrPicture { width, height, color, alpha, depth } = *picture;
     let pixels = width.checked_mul(height).filter(|&pixels| pixels > 0).ok_or_else(|| {

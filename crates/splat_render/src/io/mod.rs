@@ -82,10 +82,6 @@ pub fn read_splats(path: &Path) -> Result<Loaded> {
 
 /// Reads a file in memory, as [`read_splats`] does. `path` is its name in errors, detects formats without
 /// a signature, and locates a `.gltf`'s other files.
-///
-/// # Errors
-///
-/// As [`read_splats`].
 pub fn parse_splats(bytes: &[u8], path: &Path) -> Result<Loaded> {
     let named = Named(path);
     parse(bytes, Format::of(bytes, &named)?, &named)
@@ -142,10 +138,6 @@ pub fn write_splats(path: &Path, file: &SplatFile) -> Result<Vec<String>> {
 }
 
 /// Reads a `.ply`, INRIA's or compressed, whatever its ending.
-///
-/// # Errors
-///
-/// As [`read_splats`].
 pub fn read_ply(path: &Path) -> Result<SplatFile> {
     let named = Named(path);
     let file = open_file(path)?;
@@ -154,10 +146,6 @@ pub fn read_ply(path: &Path) -> Result<SplatFile> {
 }
 
 /// Writes INRIA's `.ply`, whatever the path's ending.
-///
-/// # Errors
-///
-/// As [`write_splats`].
 pub fn write_ply(path: &Path, file: &SplatFile) -> Result<()> {
     file.splats.validate()?;
     write_atomically(path, |out| ply::write(out, file))

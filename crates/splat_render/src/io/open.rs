@@ -8,10 +8,6 @@ use crate::error::Result;
 
 /// Opens a file for reading. Refuses pipes, sockets and devices: opening or reading one may block
 /// forever, and their content has no size to check a claim against.
-///
-/// # Errors
-///
-/// [`crate::Error::File`] that names the file.
 pub fn open_file(path: &Path) -> Result<File> {
     let named = Named(path);
     let closed = |e: std::io::Error| named.bad(format!("cannot be opened ({e})"));

@@ -36,10 +36,6 @@ enum Source {
 
 impl SplatRows {
     /// Opens a file of any format.
-    ///
-    /// # Errors
-    ///
-    /// As [`read_splats`].
     pub fn open(path: &Path) -> Result<Self> {
         if let Some(rows) = Self::open_ply(path)? {
             return Ok(rows);
@@ -84,9 +80,6 @@ impl SplatRows {
     }
 
     /// Begins again at the first splat.
-    ///
-    /// # Errors
-    /// [`crate::Error::File`]: the file cannot be read.
     pub fn rewind(&mut self) -> Result<()> {
         self.done = 0;
         if let Source::Ply(reader, _, start) = &mut self.source {
@@ -99,10 +92,6 @@ impl SplatRows {
     }
 
     /// The next splats, at most `most`; empty at the end.
-    ///
-    /// # Errors
-    ///
-    /// [`crate::Error::File`]: the file cannot be read, or ends early.
     pub fn next(&mut self, most: usize) -> Result<SplatArrays> {
         let named = Named(&self.path);
         let first = self.done;

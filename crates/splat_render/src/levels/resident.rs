@@ -78,10 +78,6 @@ impl Resident {
 
     /// Keeps the splats of a file that a choice needs. Splats it does not need are dropped as room is
     /// required.
-    ///
-    /// # Errors
-    ///
-    /// As [`read_file`].
     pub fn load(&mut self, manifest: &Manifest, choice: &Choice, file: usize) -> Result<()> {
         let read = read_file(manifest, file)?;
         self.keep(manifest, choice, file, &read);

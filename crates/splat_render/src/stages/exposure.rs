@@ -43,9 +43,6 @@ impl<T: Float> Exposure<T> {
     }
 
     /// Checks that all values are finite.
-    ///
-    /// # Errors
-    /// [`Error::Argument`] that names the value.
     pub fn validate(&self) -> Result<()> {
         let background = self.background.unwrap_or([T::zero(); 3]);
         for (name, values) in

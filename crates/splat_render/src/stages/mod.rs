@@ -55,9 +55,6 @@ impl Default for ProjectOptions {
 impl ProjectOptions {
     /// Checks every setting: `near` finite and not negative, `far` beyond it, `blur` finite and not
     /// negative.
-    ///
-    /// # Errors
-    /// [`Error::Argument`] that names the setting.
     pub fn validate(&self) -> Result<()> {
         if !(self.near.is_finite() && self.near >= 0.0) {
             return Err(Error::argument(
@@ -194,9 +191,6 @@ pub struct ImageGradients<T> {
 
 impl<T> ImageGradients<T> {
     /// Checks that these and `image` have the size of the picture of `projected`.
-    ///
-    /// # Errors
-    /// [`Error::Argument`] that names the array.
     pub fn validate(&self, projected: &Projected<T>, image: &Image<T>) -> Result<()> {
         let size = (projected.width, projected.height);
         if (image.width, image.height) != size {
@@ -360,9 +354,6 @@ impl AdamStep {
     }
 
     /// Checks every setting.
-    ///
-    /// # Errors
-    /// [`Error::Argument`] that names the setting.
     pub fn validate(&self) -> Result<()> {
         if self.number == 0 {
             return Err(Error::argument("step", "must be at least 1: the bias correction divides"));
@@ -397,9 +388,6 @@ pub struct AdamState<T> {
 
 impl<T> AdamState<T> {
     /// Checks that parameters, moments and `gradients` belong to the same splats.
-    ///
-    /// # Errors
-    /// [`Error::Argument`] that names the array.
     pub fn validate(&self, gradients: &SplatGradients<T>) -> Result<()> {
         let (n, degree) = (self.splats.len(), self.splats.sh_degree);
         for (name, arrays) in

@@ -107,9 +107,6 @@ impl Cameras {
     }
 
     /// Sets the pose priors, one for each camera, before the first step or [`Cameras::resume`].
-    ///
-    /// # Errors
-    /// [`Error::Argument`] if they are not one per camera or one of them cannot be used.
     pub fn set_pose_priors(&mut self, priors: Vec<PosePrior>) -> Result<()> {
         if priors.len() != self.initial.len() {
             let count = self.initial.len();

@@ -28,9 +28,6 @@ pub struct PosePrior {
 
 impl PosePrior {
     /// Checks that every entry can be used; `k` is the camera's number.
-    ///
-    /// # Errors
-    /// [`Error::Argument`] that names `holds[k]`.
     pub fn validate(&self, k: usize) -> Result<()> {
         let information = self.pose.as_flattened().iter().chain([&self.log_focal]);
         let diagonal = (0..POSE).map(|i| self.pose[i][i]).chain([self.log_focal]);

@@ -91,10 +91,6 @@ impl Gpu {
     }
 
     /// Compiles every kernel, several at once.
-    ///
-    /// # Errors
-    ///
-    /// [`crate::Error::Device`] with the driver's message for the first kernel that it refuses.
     pub fn compile_all(&self) -> Result<()> {
         Kernel::ALL.par_iter().for_each(|&kernel| {
             self.pipeline(kernel);

@@ -39,9 +39,6 @@ fn names(ops: &[Op]) -> Vec<&'static str> {
 
 impl PlannedFit {
     /// Plans a step with one photo, without exposure and depth, with room for `pairs` pairs.
-    ///
-    /// # Errors
-    /// [`Error::Device`](crate::Error::Device) if a buffer exceeds the largest binding.
     pub fn new(
         gpu: Gpu,
         splats: usize,
@@ -69,9 +66,6 @@ impl PlannedFit {
 
     /// Names of the commands in a run of the original density control that leaves `splats` splats, and
     /// the number of bytes that the run moves between host and device.
-    ///
-    /// # Errors
-    /// [`Error::Device`](crate::Error::Device) if a buffer exceeds the largest binding.
     pub fn original(&self, run: &OriginalRun, splats: usize) -> Result<(Vec<&'static str>, u64)> {
         let (gpu, scene) = (&self.gpu, &self.scene);
         let before = gpu.host_bytes();
