@@ -90,6 +90,21 @@ impl Weight {
 }
 
 impl Target {
+    /// A photo without weights, depths or a known background, in every round until the end.
+    pub fn new(width: u32, height: u32, channels: u32, pixels: Vec<u8>) -> Self {
+        Self {
+            width,
+            height,
+            channels,
+            pixels,
+            weights: None,
+            depth: None,
+            background: None,
+            turns: 1,
+            until: None,
+        }
+    }
+
     /// Checks sizes and values; `index` names the photo in the error.
     pub fn validate(&self, index: usize) -> Result<()> {
         let pixels = self.width as usize * self.height as usize;

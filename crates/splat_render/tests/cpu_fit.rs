@@ -7,7 +7,7 @@ use common::{random_camera, random_scene, rng};
 use splat_render::cpu::{Cpu, CpuFit};
 use splat_render::fit::{
     Background, CameraConfig, CameraState, DensityControl, Exposure, FitConfig, FitDevice,
-    FitState, Fitter, Focal, Rates, StepInput, Target, TargetDepth, splats_from_points,
+    FitState, Fitter, Focal, StepInput, Target, TargetDepth, splats_from_points,
 };
 use splat_render::{Camera, Error, ProjectOptions, Stages};
 
@@ -29,17 +29,7 @@ fn photos() -> (Vec<Target>, Vec<Camera>) {
                 let straight = c.map(|c| byte(c / a.max(1e-6)));
                 [straight[0], straight[1], straight[2], byte(a)]
             });
-            Target {
-                width: 40,
-                height: 30,
-                channels: 4,
-                pixels: pixels.collect(),
-                weights: None,
-                depth: None,
-                background: None,
-                turns: 1,
-                until: None,
-            }
+            Target::new(40, 30, 4, pixels.collect())
         })
         .collect();
     (targets, cameras)
@@ -65,10 +55,19 @@ fn start(seed: u64) -> FitState {
     FitState::new(splats_from_points(&points, &vec![[0.5; 3]; points.len()], 1).unwrap())
 }
 
+fn on_cpu(
+    targets: Vec<Target>,
+    cameras: Vec<Camera>,
+    state: FitState,
+    step: u32,
+    config: FitConfig,
+) -> Fitter {
+    Fitter::new(Box::new(CpuFit::default()), targets, cameras, state, step, config).unwrap()
+}
+
 fn fitter(density: DensityControl, state: &FitState, step: u32) -> Fitter {
     let (targets, cameras) = photos();
-    let device = Box::new(CpuFit::default());
-    Fitter::new(device, targets, cameras, state.clone(), step, config(density)).unwrap()
+    on_cpu(targets, cameras, state.clone(), step, config(density))
 }
 
 fn run(fitter: &mut Fitter, until: u32) -> FitState {
@@ -125,8 +124,7 @@ fn a_fit_leaves_frozen_splats_as_they_are_and_resumes() {
         assert_eq!(fitter.splat_count(), end.splats.len() - 40);
         assert!(fitter.splat_count() != 110 && fitter.splat_count() <= 260);
         let (targets, photos) = photos();
-        let device = Box::new(CpuFit::default());
-        let mut resumed = Fitter::new(device, targets, photos, cut, 310, config(density)).unwrap();
+        let mut resumed = on_cpu(targets, photos, cut, 310, config(density));
         resumed.resume_cameras(cameras).unwrap();
         assert!(run(&mut resumed, STEPS) == end, "{density:?} resumed ends otherwise");
     }
@@ -183,8 +181,7 @@ fn a_fit_from_coarse_to_fine_resumes_with_the_same_bits_and_moves_cameras_as_a_w
     let steps = 100;
     let coarse = |state: FitState, step| {
         let config = FitConfig { steps, coarse_to_fine: true, ..config(DensityControl::Original) };
-        let device = Box::new(CpuFit::default());
-        Fitter::new(device, targets.clone(), cameras.clone(), state, step, config).unwrap()
+        on_cpu(targets.clone(), cameras.clone(), state, step, config)
     };
     let mut whole = coarse(start(1), 0);
     run(&mut whole, 31);
@@ -256,21 +253,13 @@ fn a_photo_that_leaves_is_fitted_no_more() {
 /// One step that changes no splat, and what it says of its camera.
 fn still_step(device: &mut CpuFit, camera: Camera, step: u32) -> StepInput {
     let input = StepInput {
-        view: 0,
-        camera,
         background: [0.2, 0.5, 0.7],
         sh_degree: 1,
-        rates: Rates::ZERO,
         step,
-        ssim_weight: 0.2,
-        opacity_regularizer: 0.0,
-        scale_regularizer: 0.0,
-        noise: 0.0,
         dropout: 0.2,
         noise_seed: 3,
         camera_gradient: true,
-        exposure: None,
-        depth_weight: 0.0,
+        ..StepInput::new(0, camera)
     };
     device.step(&input).unwrap();
     input
@@ -316,8 +305,7 @@ fn exposure_fitter(state: &FitState, step: u32) -> Fitter {
     let (targets, cameras) = photos();
     let start: Vec<_> = (0..targets.len()).map(|k| (k != 1).then(Exposure::none)).collect();
     let config = FitConfig { exposures: true, ..config(DensityControl::Mcmc) };
-    let device = Box::new(CpuFit::default());
-    let mut fitter = Fitter::new(device, targets, cameras, state.clone(), step, config).unwrap();
+    let mut fitter = on_cpu(targets, cameras, state.clone(), step, config);
     let pulls = vec![0.1; start.len()];
     fitter.start_exposures(&start, &pulls).unwrap();
     fitter
@@ -354,8 +342,7 @@ fn depth_fitter(weight: f32, state: &FitState, step: u32, cameras: Option<Camera
         target.depth = (k != 1).then_some(depth);
     }
     let config = FitConfig { depth_weight: weight, cameras, ..config(DensityControl::Mcmc) };
-    let device = Box::new(CpuFit::default());
-    Fitter::new(device, targets, known, state.clone(), step, config).unwrap()
+    on_cpu(targets, known, state.clone(), step, config)
 }
 
 /// Depths of what [`photos`] show, where they are opaque.
@@ -483,8 +470,7 @@ fn the_exposure_gradient_is_the_slope_of_the_loss() {
 fn another_seed_gives_other_bits() {
     let (targets, cameras) = photos();
     let other = FitConfig { seed: 6, ..config(DensityControl::Mcmc) };
-    let device = Box::new(CpuFit::default());
-    let mut other = Fitter::new(device, targets, cameras, start(1), 0, other).unwrap();
+    let mut other = on_cpu(targets, cameras, start(1), 0, other);
     let mut one = fitter(DensityControl::Mcmc, &start(1), 0);
     assert!(run(&mut other, 20) != run(&mut one, 20));
 }
@@ -495,9 +481,7 @@ fn a_fit_that_enters_the_schedule_late_takes_a_first_step() {
         let (targets, cameras) = photos();
         let state = start(1);
         let config = FitConfig { first_step, ..config(DensityControl::Mcmc) };
-        let device = Box::new(CpuFit::default());
-        let mut fitter =
-            Fitter::new(device, targets, cameras, state.clone(), first_step, config).unwrap();
+        let mut fitter = on_cpu(targets, cameras, state.clone(), first_step, config);
         let after = run(&mut fitter, first_step + 1);
         let pairs = after.splats.opacities.iter().zip(&state.splats.opacities);
         pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
@@ -515,8 +499,7 @@ fn pixels_of_half_the_weight_count_half() {
             target.weights = weight.map(|w| vec![w; target.pixels.len() / 4]);
         }
         let config = config(DensityControl::Mcmc);
-        let device = Box::new(CpuFit::default());
-        let mut fitter = Fitter::new(device, targets, cameras, start(1), 0, config).unwrap();
+        let mut fitter = on_cpu(targets, cameras, start(1), 0, config);
         fitter.step().unwrap();
         fitter.loss().unwrap()
     };

@@ -10,7 +10,7 @@ use glam::DMat4;
 use rand::Rng;
 use splat_render::Camera;
 use splat_render::cpu::CpuFit;
-use splat_render::fit::{FitDevice, FitState, McmcRun, OriginalRun, SplatArrays};
+use splat_render::fit::{FitDevice, FitState, McmcRun, OriginalRun};
 use splat_render::gpu::{Gpu, GpuFit};
 
 fn gpu() -> Gpu {
@@ -20,17 +20,8 @@ fn gpu() -> Gpu {
 /// Splats of which some are dead, some fog and some not finite, amid a fit.
 fn amid_a_fit(seed: u64, splats: usize, sh_degree: u32) -> FitState {
     let mut rng = rng(seed);
-    let [params, first, second] = [(); 3].map(|()| {
-        let scene = random_scene(&mut rng, splats, Some(sh_degree));
-        SplatArrays {
-            means: scene.means,
-            quats: scene.quats,
-            scales: scene.scales,
-            opacities: scene.opacities,
-            sh: scene.colors,
-            sh_degree: scene.sh_degree,
-        }
-    });
+    let [params, first, second] =
+        [(); 3].map(|()| random_scene(&mut rng, splats, Some(sh_degree)).arrays());
     let mut state = FitState { first, second, ..FitState::new(params) };
     let stride = state.splats.stride();
     for i in 0..splats {

@@ -6,9 +6,7 @@ mod common;
 use std::sync::Arc;
 
 use common::*;
-use splat_render::fit::{
-    FitDevice, FitState, McmcRun, OriginalRun, Rates, SplatArrays, StepInput, Target,
-};
+use splat_render::fit::{FitDevice, FitState, McmcRun, OriginalRun, StepInput, Target};
 use splat_render::gpu::{Gpu, GpuFit, Injected, needed_limits};
 use splat_render::gpu_check::{open_tested_with, self_test};
 use splat_render::{Camera, Error};
@@ -85,28 +83,10 @@ impl Fit {
         let scene = random_scene(&mut rng, splats, Some(1));
         let camera = random_camera(&mut rng, 128, 96);
         let mut device = GpuFit::new(Arc::clone(gpu));
-        let photo = Target {
-            width: 128,
-            height: 96,
-            channels: 3,
-            pixels: vec![90; 3 * 128 * 96],
-            weights: None,
-            depth: None,
-            background: None,
-            turns: 1,
-            until: None,
-        };
+        let photo = Target::new(128, 96, 3, vec![90; 3 * 128 * 96]);
         device.set_targets(vec![photo]).unwrap();
         let mut fit = Self { device, camera };
-        fit.upload(FitState::new(SplatArrays {
-            means: scene.means,
-            quats: scene.quats,
-            scales: scene.scales,
-            opacities: scene.opacities,
-            sh: scene.colors,
-            sh_degree: scene.sh_degree,
-        }))
-        .unwrap();
+        fit.upload(FitState::new(scene.arrays())).unwrap();
         fit
     }
 
@@ -116,28 +96,13 @@ impl Fit {
 
     fn step(&mut self, step: u32) -> splat_render::Result<()> {
         self.device.step(&StepInput {
-            view: 0,
-            camera: self.camera,
-            background: [0.0; 3],
             sh_degree: 1,
-            rates: Rates {
-                means: 1e-3,
-                quats: 1e-3,
-                scales: 5e-3,
-                opacities: 5e-2,
-                sh0: 5e-3,
-                sh_rest: 2.5e-4,
-            },
+            rates: RATES,
             step,
-            ssim_weight: 0.2,
             opacity_regularizer: 0.01,
             scale_regularizer: 0.01,
-            noise: 0.0,
-            dropout: 0.0,
             noise_seed: step,
-            camera_gradient: false,
-            exposure: None,
-            depth_weight: 0.0,
+            ..StepInput::new(0, self.camera)
         })
     }
 }

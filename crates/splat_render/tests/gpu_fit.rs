@@ -8,8 +8,8 @@ use common::*;
 use rand::Rng;
 use splat_render::cpu::CpuFit;
 use splat_render::fit::{
-    DensityControl, Exposure, FitConfig, FitDevice, FitState, Fitter, Rates, SplatArrays,
-    StepInput, Target, TargetDepth,
+    DensityControl, Exposure, FitConfig, FitDevice, FitState, Fitter, Rates, StepInput, Target,
+    TargetDepth,
 };
 use splat_render::gpu::{Gpu, GpuFit};
 use splat_render::reference::Reference;
@@ -21,17 +21,6 @@ struct Capture {
     targets: Vec<Target>,
     cameras: Vec<Camera>,
     start: FitState,
-}
-
-fn arrays(scene: Scene<f32>) -> SplatArrays {
-    SplatArrays {
-        means: scene.means,
-        quats: scene.quats,
-        scales: scene.scales,
-        opacities: scene.opacities,
-        sh: scene.colors,
-        sh_degree: scene.sh_degree,
-    }
 }
 
 fn capture(seed: u64, sizes: &[(u32, u32)], splats: usize) -> Capture {
@@ -54,33 +43,15 @@ fn capture(seed: u64, sizes: &[(u32, u32)], splats: usize) -> Capture {
                 pixels.extend(color.map(byte));
             }
         }
-        let weights =
-            (k % 3 == 2).then(|| {
-                (0..width * height)
-                    .map(|_| {
-                        if rng.random::<f32>() < 0.2 {
-                            0.0
-                        } else {
-                            0.2 + 0.8 * rng.random::<f32>()
-                        }
-                    })
-                    .collect()
-            });
+        let mut weight = || {
+            if rng.random::<f32>() < 0.2 { 0.0 } else { 0.2 + 0.8 * rng.random::<f32>() }
+        };
+        let weights = (k % 3 == 2).then(|| (0..width * height).map(|_| weight()).collect());
         let channels = if rgba { 4 } else { 3 };
-        targets.push(Target {
-            width,
-            height,
-            channels,
-            pixels,
-            weights,
-            depth: None,
-            background: None,
-            turns: 1,
-            until: None,
-        });
+        targets.push(Target { weights, ..Target::new(width, height, channels, pixels) });
         cameras.push(camera);
     }
-    let start = FitState::new(arrays(random_scene(&mut rng, splats, Some(1))));
+    let start = FitState::new(random_scene(&mut rng, splats, Some(1)).arrays());
     Capture { targets, cameras, start }
 }
 
@@ -88,8 +59,6 @@ fn input(capture: &Capture, step: u32, noise: f32) -> StepInput {
     let view = step as usize % capture.cameras.len();
     let t = step as f32 * 0.37;
     StepInput {
-        view,
-        camera: capture.cameras[view],
         // Photos with alpha stand on a background that moves, the others on black.
         background: if view.is_multiple_of(2) {
             [t.fract(), (2.0 * t).fract(), 0.5]
@@ -97,24 +66,15 @@ fn input(capture: &Capture, step: u32, noise: f32) -> StepInput {
             [0.0; 3]
         },
         sh_degree: u32::from(step > 20),
-        rates: Rates {
-            means: 1e-3,
-            quats: 1e-3,
-            scales: 5e-3,
-            opacities: 5e-2,
-            sh0: 5e-3,
-            sh_rest: 2.5e-4,
-        },
+        rates: RATES,
         step,
-        ssim_weight: 0.2,
         opacity_regularizer: 0.01,
         scale_regularizer: 0.01,
         noise,
         dropout: if noise > 0.0 { 0.3 } else { 0.0 },
         noise_seed: step.wrapping_mul(2_654_435_761),
         camera_gradient: true,
-        exposure: None,
-        depth_weight: 0.0,
+        ..StepInput::new(view, capture.cameras[view])
     }
 }
 
@@ -147,6 +107,20 @@ fn camera_rows(device: &mut dyn FitDevice) -> Vec<[f64; 16]> {
             out
         })
         .collect()
+}
+
+/// Compares camera gradients with a bound relative to each row's largest value of its kind.
+fn assert_rows_close(got: &[[f64; 16]], expected: &[[f64; 16]], bound: f64) {
+    assert_eq!(got.len(), expected.len());
+    for (step, (got, expected)) in got.iter().zip(expected).enumerate() {
+        for kinds in [0..12, 12..16] {
+            let largest = expected[kinds.clone()].iter().fold(0.0f64, |a, v| a.max(v.abs()));
+            for k in kinds {
+                let off = (got[k] - expected[k]).abs();
+                assert!(off < bound * largest, "step {step}, entry {k}: {off:.1e} of {largest}");
+            }
+        }
+    }
 }
 
 fn gpu_fit() -> GpuFit {
@@ -254,20 +228,7 @@ fn cameras_get_the_gradients_that_they_get_on_the_cpu() {
     };
     let (expected, got) = (rows(&mut CpuFit::default()), rows(&mut gpu_fit()));
     assert_eq!((got.len(), expected.len()), (steps as usize, steps as usize));
-    for (step, (got, expected)) in got.iter().zip(&expected).enumerate() {
-        for kinds in [0..12, 12..16] {
-            let largest = expected[kinds.clone()].iter().fold(0.0f64, |a, v| a.max(v.abs()));
-            for k in kinds {
-                let off = (got[k] - expected[k]).abs();
-                assert!(
-                    off < 1e-3 * largest,
-                    "step {step}, entry {k}: {} for {}",
-                    got[k],
-                    expected[k]
-                );
-            }
-        }
-    }
+    assert_rows_close(&got, &expected, 1e-3);
 }
 
 #[test]
@@ -308,15 +269,7 @@ fn exposures_get_the_gradients_that_they_get_on_the_cpu() {
             assert!(gain.max(offset) < 1e-3 * largest, "{got:?} for {expected:?}");
         }
     }
-    for (got, expected) in got.1.iter().zip(&expected.1) {
-        for kinds in [0..12, 12..16] {
-            let largest = expected[kinds.clone()].iter().fold(0.0f64, |a, v| a.max(v.abs()));
-            for k in kinds {
-                let off = (got[k] - expected[k]).abs();
-                assert!(off < 1e-3 * largest, "entry {k}: {} for {}", got[k], expected[k]);
-            }
-        }
-    }
+    assert_rows_close(&got.1, &expected.1, 1e-3);
     for (got, expected) in got.2.iter().zip(&expected.2) {
         assert!((got - expected).abs() < 1e-5, "loss {got} for {expected}");
     }
@@ -368,14 +321,8 @@ fn depths_count_as_on_the_cpu_and_repeat_themselves() {
         assert_eq!(without.1[k] != got.1[k], counts, "step {step}");
         assert_eq!(without.0[k] != got.0[k], counts, "step {step}");
         assert!((got.1[k] - expected.1[k]).abs() < 1e-5, "loss {} for {}", got.1[k], expected.1[k]);
-        for kinds in [0..12, 12..16] {
-            let largest = expected.0[k][kinds.clone()].iter().fold(0.0f64, |a, v| a.max(v.abs()));
-            for entry in kinds {
-                let off = (got.0[k][entry] - expected.0[k][entry]).abs();
-                assert!(off < 2e-3 * largest, "step {step}, entry {entry}: {off:.1e} of {largest}");
-            }
-        }
     }
+    assert_rows_close(&got.0, &expected.0, 2e-3);
 }
 
 #[test]

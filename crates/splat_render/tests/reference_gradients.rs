@@ -252,19 +252,10 @@ fn photo_and_picture(seed: u64) -> (Target, Image<f64>) {
     let (width, height) = (rng.random_range(1..18u32), rng.random_range(1..18u32));
     let pixels = (width * height) as usize;
     let channels = if seed.is_multiple_of(2) { 4 } else { 3 };
-    let target = Target {
-        width,
-        height,
-        channels,
-        pixels: (0..pixels * channels as usize).map(|_| rng.random()).collect(),
-        weights: seed
-            .is_multiple_of(3)
-            .then(|| (0..pixels).map(|_| rng.random_range(0.1..1.0)).collect()),
-        depth: None,
-        background: None,
-        turns: 1,
-        until: None,
-    };
+    let colors = (0..pixels * channels as usize).map(|_| rng.random()).collect();
+    let weighted = seed.is_multiple_of(3);
+    let weights = weighted.then(|| (0..pixels).map(|_| rng.random_range(0.1..1.0)).collect());
+    let target = Target { weights, ..Target::new(width, height, channels, colors) };
     let image = Image {
         width,
         height,

@@ -468,17 +468,9 @@ mod tests {
         let photos = [(70, 300, true), (7, 20, false), (333, 150, false)];
         let photos = photos.map(|(width, height, weighted)| {
             let pixels = (width * height) as usize;
-            Target {
-                width,
-                height,
-                channels: 3,
-                weights: weighted.then(|| (0..pixels).map(|_| rng.random()).collect()),
-                pixels: (0..3 * pixels).map(|_| rng.random()).collect(),
-                depth: None,
-                background: None,
-                turns: 1,
-                until: None,
-            }
+            let colors = (0..3 * pixels).map(|_| rng.random()).collect();
+            let weights = weighted.then(|| (0..pixels).map(|_| rng.random()).collect());
+            Target { weights, ..Target::new(width, height, 3, colors) }
         });
         let x: Vec<f32> = (0..333 * 150).map(|_| rng.random()).collect();
         let run = |threads: usize, kept: bool| {

@@ -139,17 +139,9 @@ mod tests {
         let v = Cpu.rasterize_backward(splats, [0.1, 0.2, 0.3], &image, &v_image, true).unwrap();
         let [r, g, b]: [Vec<f32>; 3] =
             std::array::from_fn(|c| image.color.iter().map(|color| color[c]).collect());
-        let photo = Target {
-            width: splats.width,
-            height: splats.height,
-            channels: 3,
-            pixels: image.color.as_flattened().iter().map(|v| (255.0 * (1.0 - v)) as u8).collect(),
-            weights: Some(r.clone()),
-            depth: None,
-            background: None,
-            turns: 1,
-            until: None,
-        };
+        let pixels = image.color.as_flattened().iter().map(|v| (255.0 * (1.0 - v)) as u8);
+        let photo = Target::new(splats.width, splats.height, 3, pixels.collect());
+        let photo = Target { weights: Some(r.clone()), ..photo };
         let mut loss = Loss::default();
         let mut out = vec![loss.run([&r, &g, &b], &photo, [0.0; 3], 0.2)];
         out.extend(loss.v_color.iter().flatten());

@@ -270,17 +270,7 @@ mod tests {
     use super::*;
 
     fn photo(level: u8) -> Target {
-        Target {
-            width: 2,
-            height: 1,
-            channels: 3,
-            pixels: vec![level, level, level, level / 2, level / 2, level / 2],
-            weights: None,
-            depth: None,
-            background: None,
-            turns: 1,
-            until: None,
-        }
+        Target::new(2, 1, 3, [[level; 3], [level / 2; 3]].concat())
     }
 
     fn gradient(view: usize, v_gain: f64, v_offset: f64) -> ExposureGradient {

@@ -93,6 +93,27 @@ pub struct StepInput {
 }
 
 impl StepInput {
+    /// A first step that moves nothing, over black, without noise, dropout or depths.
+    pub fn new(view: usize, camera: Camera) -> Self {
+        Self {
+            view,
+            camera,
+            background: [0.0; 3],
+            sh_degree: 0,
+            rates: Rates::ZERO,
+            step: 1,
+            ssim_weight: 0.2,
+            opacity_regularizer: 0.0,
+            scale_regularizer: 0.0,
+            noise: 0.0,
+            dropout: 0.0,
+            noise_seed: 0,
+            camera_gradient: false,
+            depth_weight: 0.0,
+            exposure: None,
+        }
+    }
+
     /// Checks the settings against the sizes of the device's photos, `(width, height)` in pixels.
     pub fn validate(&self, sizes: impl ExactSizeIterator<Item = (u32, u32)>) -> Result<()> {
         let (count, mut sizes) = (sizes.len(), sizes);

@@ -110,19 +110,8 @@ fn camera() -> Camera {
 }
 
 fn photo() -> Target {
-    Target {
-        width: SIZE.0,
-        height: SIZE.1,
-        channels: 3,
-        pixels: (0..3 * SIZE.0 as usize * SIZE.1 as usize)
-            .map(|k| (255.0 * draw(k)) as u8)
-            .collect(),
-        weights: None,
-        depth: None,
-        background: None,
-        turns: 1,
-        until: None,
-    }
+    let values = 3 * SIZE.0 as usize * SIZE.1 as usize;
+    Target::new(SIZE.0, SIZE.1, 3, (0..values).map(|k| (255.0 * draw(k)) as u8).collect())
 }
 
 /// Depths a third before and behind the scene's, at pixels whose alpha is clearly above or below the
@@ -230,21 +219,14 @@ fn a_fit(device: &mut dyn FitDevice) -> Result<Outputs> {
     device.upload(begin.clone())?;
     let AdamStep { rates, sh_degree, opacity_regularizer, scale_regularizer, .. } = adam_step();
     let input = StepInput {
-        view: 0,
-        camera: camera(),
         background: BACKGROUND.map(|v| v as f32),
         sh_degree,
         rates,
         step: 5,
-        ssim_weight: 0.2,
         opacity_regularizer,
         scale_regularizer,
-        noise: 0.0,
-        dropout: 0.0,
-        noise_seed: 0,
         camera_gradient: true,
-        depth_weight: 0.0,
-        exposure: None,
+        ..StepInput::new(0, camera())
     };
     device.step(&input)?;
     let step = device.download()?;

@@ -2,7 +2,7 @@
 //! options that make no sense.
 
 use splat_render::constants::{BLUR, FAR, NEAR};
-use splat_render::fit::{DensityStats, FitDevice, FitState, Rates, StepInput, Target};
+use splat_render::fit::{FitDevice, FitState, Rates, StepInput, Target};
 use splat_render::stages::{AdamStep, ImageGradients, Projected};
 use splat_render::{Error, ProjectOptions, Stages};
 
@@ -143,32 +143,22 @@ fn fitted(device: &mut dyn FitDevice) -> (FitState, StepInput) {
     let mut rng = rng(94);
     let (state, _) = random_adam(&mut rng, 130, 2);
     let camera = random_camera(&mut rng, 40, 30);
-    let stats = DensityStats::zeros(130);
-    let state = FitState {
-        splats: state.splats,
-        first: state.first,
-        second: state.second,
-        stats,
-        frozen: 0,
-    };
+    let (first, second) = (state.first, state.second);
+    let state = FitState { first, second, ..FitState::new(state.splats) };
     device.set_targets(vec![random_target(&mut rng, 40, 30, false, false)]).unwrap();
     device.upload(state.clone()).unwrap();
     let input = StepInput {
-        view: 0,
-        camera,
         background: [0.2; 3],
         sh_degree: 1,
         rates: full_step(1).rates,
         step: 3,
-        ssim_weight: 0.2,
         opacity_regularizer: 0.01,
         scale_regularizer: 0.01,
         noise: 1.0,
         dropout: 0.1,
         noise_seed: 9,
         camera_gradient: true,
-        exposure: None,
-        depth_weight: 0.0,
+        ..StepInput::new(0, camera)
     };
     (state, input)
 }

@@ -26,6 +26,7 @@ use glam::{DMat3, DMat4, DQuat, DVec3};
 use rand::{Rng, SeedableRng};
 use rand_pcg::Pcg64;
 use splat_render::constants::BLUR;
+use splat_render::fit::Rates;
 use splat_render::splats::SplatArrays;
 use splat_render::stages::{
     AdamState, Colors, Exposure, Image, ImageGradients, Projected, ProjectedGradients,
@@ -74,7 +75,23 @@ impl<T> Scene<T> {
     }
 }
 
+/// Rates of a fit's steps.
+pub const RATES: Rates =
+    Rates { means: 1e-3, quats: 1e-3, scales: 5e-3, opacities: 5e-2, sh0: 5e-3, sh_rest: 2.5e-4 };
+
 impl Scene<f32> {
+    /// The splats of a fit.
+    pub fn arrays(self) -> SplatArrays {
+        SplatArrays {
+            means: self.means,
+            quats: self.quats,
+            scales: self.scales,
+            opacities: self.opacities,
+            sh: self.colors,
+            sh_degree: self.sh_degree,
+        }
+    }
+
     pub fn widen(&self) -> Scene<f64> {
         Scene {
             means: widen(&self.means),

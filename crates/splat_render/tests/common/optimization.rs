@@ -28,17 +28,9 @@ pub fn random_target(
         let w = rng.random::<f32>();
         if w < 0.3 { 0.0 } else { w }
     };
-    Target {
-        width,
-        height,
-        channels,
-        pixels: (0..pixels * channels as usize).map(|_| rng.random()).collect(),
-        weights: weighted.then(|| (0..pixels).map(|_| weight(rng)).collect()),
-        depth: None,
-        background: None,
-        turns: 1,
-        until: None,
-    }
+    let colors = (0..pixels * channels as usize).map(|_| rng.random()).collect();
+    let weights = weighted.then(|| (0..pixels).map(|_| weight(rng)).collect());
+    Target { weights, ..Target::new(width, height, channels, colors) }
 }
 
 /// A picture of random colors in 0..1.
@@ -192,15 +184,7 @@ pub fn random_adam(
     n: usize,
     sh_degree: u32,
 ) -> (AdamState<f32>, SplatGradients<f32>) {
-    let scene = random_scene(rng, n, Some(sh_degree));
-    let splats = SplatArrays {
-        means: scene.means,
-        quats: scene.quats,
-        scales: scene.scales,
-        opacities: scene.opacities,
-        sh: scene.colors,
-        sh_degree,
-    };
+    let splats = random_scene(rng, n, Some(sh_degree)).arrays();
     let mut like = |scale: f64, square: bool| {
         let mut value = || {
             let v = scale * normal(rng);

@@ -1,8 +1,6 @@
 //! Colors of splats that a step does not see take its update later; no bit may tell.
 
-use splat_render::fit::{
-    COLOR_WAIT, DensityStats, FitDevice, FitState, McmcRun, OriginalRun, Rates, StepInput,
-};
+use splat_render::fit::{COLOR_WAIT, FitDevice, FitState, McmcRun, OriginalRun, Rates, StepInput};
 
 use super::optimization::{random_adam, random_target};
 use super::*;
@@ -25,7 +23,6 @@ fn begin(device: &mut dyn FitDevice, seed: u64) -> (Vec<Camera>, FitState) {
         state.first.clear(i);
         state.second.clear(i);
     }
-    state.stats = DensityStats::zeros(300);
     let cameras: Vec<Camera> = (0..4)
         .map(|_| {
             let camera = random_camera(&mut rng, 40, 30);
@@ -52,21 +49,16 @@ fn input(cameras: &[Camera], step: u32) -> StepInput {
         sh_rest: 2.5e-4 * rate,
     };
     StepInput {
-        view,
-        camera: cameras[view],
         background: [0.2, 0.4, 0.6],
         sh_degree: [1, 2, 3][(step > GROWS[0]) as usize + (step > GROWS[1]) as usize],
         rates: if FROZEN.contains(&step) { Rates::ZERO } else { rates },
         step,
-        ssim_weight: 0.2,
         opacity_regularizer: 0.01,
         scale_regularizer: 0.01,
         noise: 10.0,
         dropout: 0.1,
         noise_seed: step.wrapping_mul(2_654_435_761),
-        camera_gradient: false,
-        exposure: None,
-        depth_weight: 0.0,
+        ..StepInput::new(view, cameras[view])
     }
 }
 
