@@ -62,8 +62,7 @@ impl Devices {
         DEVICES.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Opens the device that a slot is for, unless it holds one that is not lost. A failure is kept: to
-    /// try again at each call would cost seconds.
+    /// Opens a slot's device unless it is open. Failures are kept, because each try takes seconds.
     fn opened<'a>(slot: &'a mut Option<Opened>, software: bool, injected: &Injected) -> &'a Opened {
         if slot.as_ref().is_none_or(|opened| opened.as_ref().is_ok_and(|gpu| gpu.is_lost())) {
             *slot = Some(open_tested_with(software, injected));
@@ -84,8 +83,7 @@ impl Devices {
     }
 }
 
-/// The device of the backend "gpu": the best adapter, opened and tested once per process, and again
-/// after it was lost.
+/// The device of the backend "gpu": opened and tested once per process, and again if lost.
 pub fn gpu() -> PyResult<Arc<Gpu>> {
     let mut devices = Devices::lock();
     match devices.named() {

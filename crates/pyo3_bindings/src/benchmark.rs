@@ -1,5 +1,4 @@
-//! Functions for benchmarks: stages timed without array conversion, the machine's peak speed, and pixels
-//! at which rounding may change the picture.
+//! Functions for benchmarks: timed stages, the machine's peak speed, and pixels that rounding may change.
 
 use std::time::{Duration, Instant};
 
@@ -19,8 +18,8 @@ use crate::stages::{
     PARAMETERS, Parameters, PictureGradients, Real, SplatArrays, View, projected_from, with_stages,
 };
 
-/// Speed of multiply-adds on all CPU threads, in 10^9 floating-point operations per second, measured
-/// for about `seconds` with the instruction set that the backend "cpu" uses.
+/// Speed of multiply-adds on all threads in Gflop/s, measured for `seconds` with the CPU backend's
+/// instructions.
 #[pyfunction]
 pub fn peak_multiply_add(py: Python<'_>, seconds: f64) -> PyResult<f64> {
     let duration = Duration::try_from_secs_f64(seconds)

@@ -9,8 +9,8 @@ use crate::arrays::{elements, entry, rows, shaped, shaped_rows};
 use crate::camera::viewmat;
 use crate::splat_arrays::splat_arrays_from;
 
-/// Reads the state of a fit and the steps done. Without moments, the fit is new and starts at
-/// `first_step`. The last `frozen` splats stay as they are.
+/// Reads a fit's state and step; without moments, a new fit at `first_step`. `frozen` counts from the
+/// end.
 pub fn state_from(
     dict: &Bound<'_, PyDict>,
     first_step: u32,

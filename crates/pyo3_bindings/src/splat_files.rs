@@ -25,8 +25,7 @@ pub fn read_splats<'py>(py: Python<'py>, path: PathBuf) -> PyResult<Bound<'py, P
     Ok(dict)
 }
 
-/// Writes a splat file in the format of its ending, whole or not at all. Returns a message for
-/// each thing that the format cannot hold.
+/// Writes a file in the format of its ending, whole or not at all; returns notes on omitted content.
 #[pyfunction]
 pub fn write_splats(
     py: Python<'_>,

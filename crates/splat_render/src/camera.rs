@@ -84,8 +84,7 @@ impl Camera {
         -(self.rotation().transpose() * self.translation())
     }
 
-    /// Limits of x/z and y/z in the Jacobian: `[x_low, x_high, y_low, y_high]`,
-    /// [`JACOBIAN_MARGIN`] of tan(fov/2) beyond each image edge.
+    /// `[x_low, x_high, y_low, y_high]` of x/z and y/z in the Jacobian; see [`JACOBIAN_MARGIN`].
     pub fn jacobian_limits(&self) -> [f64; 4] {
         let margin = f64::from(JACOBIAN_MARGIN);
         let (w, h) = (f64::from(self.width), f64::from(self.height));

@@ -1,5 +1,4 @@
-//! Every numeric threshold of the renderer, once, as the f32 value that all three implementations
-//! use (the f64 reference widens it, so that no comparison lands on another side there).
+//! The renderer's thresholds as f32; the f64 reference widens them, so that comparisons agree.
 
 /// Side of a square tile in pixels. 16 keeps a tile's state inside the first-level cache.
 pub const TILE: u32 = 16;

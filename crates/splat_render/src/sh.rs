@@ -1,5 +1,4 @@
-//! Real spherical harmonics of degree 0-4 in the basis, order and signs of 3DGS and gsplat
-//! (Sloan, "Efficient Spherical Harmonic Evaluation", 2013).
+//! Real spherical harmonics of degree 0-4 in the basis, order and signs of 3DGS (Sloan, 2013).
 
 use std::ops::{Add, Mul, Neg, Sub};
 

@@ -76,8 +76,7 @@ impl Weight {
         }
     }
 
-    /// Weight of one channel of a pixel of weight 1 in the loss, which is a mean; 0 if the photo is
-    /// masked out everywhere.
+    /// Weight of one channel of a pixel of weight 1 in the loss; 0 if all is masked out.
     pub(crate) fn scale(&self) -> f64 {
         if self.count > 0.0 { 1.0 / (3.0 * self.count) } else { 0.0 }
     }

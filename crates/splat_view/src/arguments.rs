@@ -45,16 +45,17 @@ View:
   --help, --version";
 
 /// Backend that renders without a window.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Backend {
     /// A real GPU if one answers, else the CPU.
+    #[default]
     Auto,
     /// Any adapter, software ones too.
     Gpu,
     Cpu,
 }
 
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Default)]
 pub struct Arguments {
     pub scenes: Vec<PathBuf>,
     pub screenshot: Option<PathBuf>,
@@ -93,23 +94,7 @@ const FRAMES_MAX: f64 = 100_000.0;
 impl Arguments {
     /// Reads the command line, the program's name left out.
     pub fn parse(words: impl IntoIterator<Item = OsString>) -> Result<Asked> {
-        let mut out = Self {
-            scenes: Vec::new(),
-            screenshot: None,
-            frames: None,
-            time: None,
-            size: None,
-            backend: Backend::Auto,
-            drawing: Drawing::Auto,
-            cameras: None,
-            budget: None,
-            camera: None,
-            orbit: None,
-            up: None,
-            fov: None,
-            near: None,
-            background: None,
-        };
+        let mut out = Self::default();
         let mut parser = lexopt::Parser::from_args(words);
         let wrong = |error: lexopt::Error| {
             Error::argument("splat-view", format!("{error}; splat-view --help lists what it takes"))

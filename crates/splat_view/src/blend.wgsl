@@ -1,5 +1,4 @@
-// Draws each splat as a quad, blended back to front. Follows splat_render's shared.wgsl, which has the
-// project stage's Splat2d.
+// Draws each splat as a quad, blended back to front. Follows splat_render's shared.wgsl.
 
 struct Style {
     // Rows of the world-to-camera matrix.

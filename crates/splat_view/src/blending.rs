@@ -1,5 +1,4 @@
-//! Draws splats onto a canvas with the blending unit: splat_render projects and sorts them, and each is a
-//! quad, back to front.
+//! Draws splats onto a canvas with the blending unit, as quads, back to front.
 
 use bytemuck::{Pod, Zeroable};
 use splat_render::gpu::{Gpu, ResidentSplats, ResidentView, shared_wgsl};
@@ -92,8 +91,8 @@ impl Blending {
         })
     }
 
-    /// Records a model's picture onto columns `begin..end` of a canvas; depths are divided by `unit`. One
-    /// picture per model and submission.
+    /// Draws a model onto columns `begin..end`; depths are in `depth_unit`. Once per model and
+    /// submission.
     pub fn record(
         &self,
         gpu: &Gpu,

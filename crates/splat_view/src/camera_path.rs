@@ -22,8 +22,7 @@ fn cubic(a: DVec3, b: DVec3, c: DVec3, d: DVec3, t: f64) -> DVec3 {
 }
 
 impl CameraPath {
-    /// Number of pictures of the whole path, with `between` from each place to the next, both ends
-    /// included.
+    /// Number of pictures of the path, with `between` from each place to the next, ends included.
     pub fn pictures(&self, between: u32) -> u32 {
         match self.keys.len() {
             0 => 0,

@@ -87,8 +87,7 @@ impl Frame {
     }
 }
 
-/// Reads the cameras in a file, or in a folder's `cameras.json`, in the file's order. Every camera that
-/// is returned is valid.
+/// Reads the cameras of a file or of a folder's `cameras.json`, in order; all are valid.
 pub fn read_cameras(path: &Path) -> Result<Vec<CaptureCamera>> {
     let Some(file) = find_cameras(path) else {
         let reason = match path.is_dir() {

@@ -9,8 +9,7 @@ use splat_render::{Camera, Error, Result};
 
 /// Default maximum number of splats in memory.
 pub const BUDGET: usize = 1_000_000;
-/// Splats nearer to each other than this, in pixels, are fine enough: finer ones would look worse, as each
-/// covers a part of a pixel and is drawn as large as one.
+/// Distance of splats in pixels that is fine enough; finer ones are drawn too large.
 const FINE: f64 = 1.5;
 
 pub fn is_in_levels(path: &Path) -> bool {

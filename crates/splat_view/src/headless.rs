@@ -175,8 +175,7 @@ fn write(path: &Path, image: &Image<f32>) -> Result<()> {
     write_png(path, [image.width, image.height], &to_bytes(image))
 }
 
-/// Draws frames as the window does. Prints the time of each stage, and the picture's error against the
-/// rasterizer's.
+/// Times frames as the window draws them, and compares the picture with the rasterizer's.
 fn time(scene: &Scene, frames: u32) -> Result<()> {
     let gpu = Arc::new(Gpu::new(true)?);
     check_size(&gpu, [scene.camera.width, scene.camera.height])?;
@@ -222,7 +221,6 @@ fn time(scene: &Scene, frames: u32) -> Result<()> {
     println!("median milliseconds of {frames} frames at {width}x{height}");
     for (stage, name) in STAGES.iter().enumerate() {
         let took: Vec<f32> = stages.iter().map(|times| times[stage]).collect();
-        // A second model and the panel are the window's alone.
         if took.iter().any(|&ms| ms > 0.0) {
             println!("{name:>12} {:9.2}", median(took));
         }

@@ -42,9 +42,8 @@ use std::ffi::OsString;
 use arguments::{Arguments, Asked, HELP};
 use splat_render::Result;
 
-/// Runs a command line without the program's name, and prints errors.
-///
-/// Returns the exit status. Only the process's first thread may open a window.
+/// Runs a command line without the program's name; prints errors and returns the exit status. Only the
+/// process's first thread may open a window.
 pub fn run(words: impl IntoIterator<Item = OsString>) -> u8 {
     match asked(words) {
         Ok(()) => 0,

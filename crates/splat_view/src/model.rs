@@ -19,8 +19,7 @@ pub struct Model {
     pub file: SplatFile,
     /// Center of the visible splats, in world coordinates.
     pub center: DVec3,
-    /// Radius about the center that holds 90 % of the visible splats, at most four times the radius for
-    /// 50 %.
+    /// Radius with 90 % of the visible splats, at most four times the radius with 50 %.
     pub radius: f64,
     /// Messages about ignored content.
     pub notes: Vec<String>,
@@ -31,8 +30,7 @@ pub struct Model {
 }
 
 impl Model {
-    /// Reads a splat file, a checkpoint of a fit, or a scene in levels of detail with at most `budget`
-    /// splats.
+    /// Reads a splat file, a fit's checkpoint, or at most `budget` splats of a scene in levels.
     pub fn read(path: &Path, budget: Option<usize>) -> Result<Self> {
         if is_in_levels(path) {
             let (detail, file) = Detail::open(path, budget.unwrap_or(BUDGET))?;

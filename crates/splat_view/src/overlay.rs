@@ -88,10 +88,8 @@ pub fn photo(viewer: &Viewer, ui: &Ui, size: [u32; 2], texture: &TextureHandle) 
     ui.painter().image(texture.id(), rect, whole, tint);
 }
 
-/// Moves the divider between two models during a drag; returns whether it is dragged.
-///
-/// The press position decides. egui uses the position at the end of the frame, which on a slow device is
-/// past the divider already.
+/// Moves the divider during a drag; returns whether it is dragged. The press position decides: egui's
+/// position, at the end of the frame, may be past the divider.
 pub fn hold_divider(viewer: &mut Viewer, ui: &Ui) -> bool {
     if !viewer.compares() {
         viewer.holds_divider = false;

@@ -53,8 +53,7 @@ impl Rasterizing {
         Ok(PictureBuffers { size, picture, place, bindings })
     }
 
-    /// Draws a model's picture onto columns `begin..end` of a canvas, at least one. The work is
-    /// submitted, so that the buffers are free for the next model.
+    /// Draws a model onto columns `begin..end` of a canvas and submits the work.
     pub fn draw(
         &self,
         gpu: &Gpu,

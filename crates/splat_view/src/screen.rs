@@ -140,8 +140,7 @@ impl Screen {
         }
     }
 
-    /// The texture to draw in, None if there is none this time; and whether the surface must be
-    /// configured again.
+    /// The texture to draw in, if any, and whether the surface must be configured again.
     pub fn acquire(&self) -> Result<(Option<wgpu::SurfaceTexture>, bool)> {
         let current = match self.window.inner_size() {
             // Minimized: there is nothing to draw on.
@@ -164,8 +163,7 @@ impl Screen {
         })
     }
 
-    /// Records the interface onto a target, over its content or, with `LoadOp::Clear`, alone. Submit the
-    /// returned command buffers before the encoder's.
+    /// Records the interface onto a target. Submit the returned buffers before the encoder's.
     pub fn record(
         &mut self,
         encoder: &mut wgpu::CommandEncoder,

@@ -46,8 +46,7 @@ pub fn stamp(path: &Path) -> Option<Stamp> {
     Some((metadata.modified().ok()?, metadata.len()))
 }
 
-/// The models at a path: the file itself, or the models of a fit or a refinement in a folder, default
-/// first.
+/// The models at a path: the file, or a folder's models of a fit or refinement, default first.
 pub fn find_sources(path: &Path) -> Result<Vec<Source>> {
     if !path.is_dir() {
         let name = path.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned());

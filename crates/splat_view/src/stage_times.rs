@@ -5,8 +5,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use splat_render::gpu::Gpu;
 
-/// The stages of a frame: the first six for each of two models. A model is drawn by blending, or
-/// by bin, rasterize and canvas.
+/// The stages of a frame; the first six twice, once per model.
 pub const STAGES: [&str; 14] = [
     "project",
     "sort",
@@ -127,8 +126,7 @@ impl StageTimes {
         Self { queries, last: None }
     }
 
-    /// Timestamp writes of a frame's passes, from stage `first`; none while an earlier frame's times are
-    /// being read back.
+    /// Timestamp writes from stage `first` on; none while a read-back is pending.
     pub fn stamps(&self, first: usize) -> Stamps<'_> {
         let set = self.queries.as_ref().filter(|q| !q.is_pending).map(|q| &q.set);
         Stamps { set, first }
@@ -172,8 +170,7 @@ impl StageTimes {
         self.queries.as_ref().is_some_and(|q| q.is_pending)
     }
 
-    /// Milliseconds of each stage of the latest frame whose times have arrived, 0 for stages that it did
-    /// not have; None before the first.
+    /// Milliseconds of the latest timed frame's stages, 0 for absent ones; None before the first.
     pub fn latest(&mut self) -> Option<[f32; STAGES.len()]> {
         if let Some(q) = &mut self.queries
             && q.is_mapped.swap(false, Ordering::Acquire)

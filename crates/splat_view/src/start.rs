@@ -1,5 +1,4 @@
-//! Files named on the command line, read before a window opens so that errors are printed in the
-//! terminal.
+//! Reads the command line's files before a window opens, so that errors are printed.
 
 use std::path::PathBuf;
 

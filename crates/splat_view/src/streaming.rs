@@ -1,5 +1,4 @@
-//! Follows the view of a scene in levels of detail: a thread reads splats for the camera while the window
-//! keeps drawing.
+//! Follows the view of a scene in levels of detail: a thread reads splats while the window draws.
 
 use std::sync::mpsc::{Receiver, Sender, SyncSender, channel, sync_channel};
 use std::time::{Duration, Instant};

@@ -181,8 +181,7 @@ impl Viewer {
         }
     }
 
-    /// Makes the surface at a pixel the pivot of orbits and the center of the picture. False if the pixel
-    /// is empty.
+    /// Moves the pivot of orbits to the surface at a pixel; false if the pixel is empty.
     pub fn focus(
         &mut self,
         painter: &mut Painter,

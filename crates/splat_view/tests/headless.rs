@@ -4,7 +4,10 @@ mod common;
 
 use std::path::Path;
 
-use common::{Folder, ball, program, read_png, refused, run, said, write, write_cameras};
+use common::{
+    Folder, Picture, ball, command, draw, program, read_png, refused, refused_with, run, said,
+    write, write_cameras,
+};
 use glam::{DMat4, DVec3};
 use splat_render::cpu::Cpu;
 use splat_render::io::SplatFile;
@@ -49,9 +52,9 @@ fn a_capture_s_camera_draws_what_the_rasterizer_draws_on_cpu_and_gpu() {
     write_cameras(&folder.join("cameras.json"), &[camera()]);
     let expected = bytes(&drawn(&file, &camera()));
     for backend in ["cpu", "gpu"] {
-        let output =
-            run(&[&scene, &"--screenshot", &out, &"--camera", &"0", &"--backend", &backend]);
-        // Mesa's, of a desktop that pictures do not need.
+        let mut command = command(&scene, &format!("--camera 0 --backend {backend}"));
+        let output = run(command.arg("--screenshot").arg(&out));
+        // Mesa's error message on machines without a desktop.
         assert!(!said(&output).contains("XDG_RUNTIME_DIR"), "{}", said(&output));
         let picture = read_png(&out);
         assert_eq!(picture.size, [120, 80]);
@@ -68,7 +71,7 @@ fn exr_holds_color_alpha_and_expected_depth() {
     let file = ball(200, 2, [0.5; 3]);
     write(&scene, &file);
     write_cameras(&folder.join("cameras.json"), &[camera()]);
-    run(&[&scene, &"--screenshot", &out, &"--camera", &"0", &"--backend", &"cpu"]);
+    run(command(&scene, "--camera 0 --backend cpu --screenshot").arg(&out));
     let image = exr::prelude::read_first_flat_layer_from_file(&out).expect("an EXR");
     let names: Vec<String> =
         image.layer_data.channel_data.list.iter().map(|c| c.name.to_string()).collect();
@@ -92,23 +95,16 @@ fn exr_holds_color_alpha_and_expected_depth() {
 #[test]
 fn sizes_orbits_and_backgrounds_are_as_asked() {
     let folder = Folder::new();
-    let (scene, out) = (folder.join("scene.splat"), folder.join("out.png"));
+    let scene = folder.join("scene.splat");
     write(&scene, &ball(300, 3, [0.3, 0.5, 0.7]));
-    let draw = |arguments: &[&dyn AsRef<std::ffi::OsStr>]| {
-        let mut all: Vec<&dyn AsRef<std::ffi::OsStr>> =
-            vec![&scene, &"--screenshot", &out, &"--size", &"90x60", &"--backend", &"cpu"];
-        all.extend(arguments);
-        run(&all);
-        read_png(&out)
-    };
-    let first = draw(&[]);
+    let draw = |options: &str| draw(&scene, &format!("--size 90x60 {options}")).0;
+    let first = draw("");
     assert_eq!(first.size, [90, 60]);
-    assert!(draw(&[&"--orbit", &"40"]).apart(&first).1 > 2.0, "an orbit changes nothing");
-    assert!(draw(&[&"--orbit", &"360"]).apart(&first).0 <= 1, "a full turn does not return");
-    assert!(draw(&[&"--up", &"z"]).apart(&first).1 > 2.0, "up changes nothing");
-    let corner = &draw(&[&"--background", &"0.2,0.4,1"]).rgb[..3];
-    assert_eq!(corner, [51, 102, 255]);
-    // Seen from farther away with the lens narrower, all of it is in the picture, and larger than a dot.
+    assert!(draw("--orbit 40").apart(&first).1 > 2.0, "an orbit changes nothing");
+    assert!(draw("--orbit 360").apart(&first).0 <= 1, "a full turn does not return");
+    assert!(draw("--up z").apart(&first).1 > 2.0, "up changes nothing");
+    assert_eq!(draw("--background 0.2,0.4,1").rgb[..3], [51, 102, 255]);
+    // The whole scene is in the picture, and larger than a dot.
     let lit = first.rgb.chunks_exact(3).filter(|p| p.iter().any(|&v| v > 20)).count();
     assert!((90 * 60 / 10..90 * 60).contains(&lit), "{lit} pixels are lit");
 }
@@ -118,17 +114,7 @@ fn frames_of_a_full_turn_are_all_different() {
     let folder = Folder::new();
     let (scene, frames) = (folder.join("scene.ply"), folder.join("frames"));
     write(&scene, &ball(200, 4, [0.5, 0.3, 0.6]));
-    run(&[
-        &scene,
-        &"--frames",
-        &frames,
-        &"--orbit",
-        &"4",
-        &"--size",
-        &"60x40",
-        &"--backend",
-        &"cpu",
-    ]);
+    run(command(&scene, "--orbit 4 --size 60x40 --backend cpu --frames").arg(&frames));
     let mut names: Vec<String> = std::fs::read_dir(&frames)
         .expect("frames")
         .map(|e| e.expect("entry").file_name().to_string_lossy().into_owned())
@@ -157,13 +143,8 @@ fn splats_that_are_not_finite_are_left_out_and_counted() {
     with.splats.append(&broken.splats);
     write(&dirty, &with);
     write_cameras(&folder.join("cameras.json"), &[camera()]);
-    let draw = |scene: &Path| {
-        let out = scene.with_extension("png");
-        let output = run(&[&scene, &"--screenshot", &out, &"--camera", &"0", &"--backend", &"cpu"]);
-        (read_png(&out), said(&output))
-    };
-    let (dirty_picture, notes) = draw(&dirty);
-    assert!(draw(&clean).0 == dirty_picture, "broken splats change the picture");
+    let (dirty_picture, notes) = draw(&dirty, "--camera 0");
+    assert!(draw(&clean, "--camera 0").0 == dirty_picture, "broken splats change the picture");
     assert!(notes.contains("3 of 103 splats"), "{notes}");
 }
 
@@ -183,84 +164,71 @@ fn files_that_hold_no_splats_are_refused_in_one_message() {
         let scene = folder.join(name);
         std::fs::write(&scene, bytes).expect("file");
         let out = folder.join("out.png");
-        let output = program().arg(&scene).arg("--screenshot").arg(&out).output().expect("start");
-        refused(&output, &[name, word]);
+        refused(command(&scene, "--screenshot").arg(&out), &[name, word]);
         assert!(!out.exists(), "{name} left a picture");
-        // The same where a window was asked for: it is said before any is opened.
-        refused(&program().arg(&scene).output().expect("start"), &[name, word]);
+        // The same before a window opens.
+        refused(&mut command(&scene, ""), &[name, word]);
     }
-    let nothing = program().arg(folder.join("no.ply")).output().expect("start");
-    refused(&nothing, &["no.ply", "cannot be opened"]);
-    let none = Folder::new();
-    let no_scene = program().arg(&none.0).args(["--time", "1"]).output().expect("start");
-    refused(&no_scene, &["holds no scene.ply"]);
+    refused(&mut command(&folder.join("no.ply"), ""), &["no.ply", "cannot be opened"]);
+    refused(&mut command(&Folder::new().0, "--time 1"), &["holds no scene.ply"]);
 }
 
 #[test]
 fn arguments_that_make_no_sense_are_refused_in_one_message() {
     let folder = Folder::new();
-    let scene = folder.join("scene.ply");
+    let (scene, out) = (folder.join("scene.ply"), folder.join("out.png"));
     write(&scene, &ball(10, 7, [0.5; 3]));
-    let out = folder.join("out.png");
-    let out = out.to_str().expect("text");
-    let bad: [(&[&str], &[&str]); 12] = [
-        (&["--size", "0x3"], &["--size", "800x600"]),
-        (&["--size", "99999x3"], &["--size"]),
-        (&["--camera", "0"], &["--camera", "--cameras"]),
-        (&["--frames", "x"], &["--screenshot, --frames"]),
-        (&["--fov", "NaN"], &["--fov"]),
-        (&["--background", "1,2"], &["--background"]),
-        (&["--backend", "cuda"], &["--backend", "cuda"]),
-        (&["--draw", "blend"], &["--draw", "--time"]),
-        (&["--draw", "paint"], &["--draw", "paint"]),
-        (&["--nonsense"], &["--nonsense"]),
-        (&["--cameras", out], &["out.png"]),
-        (&["another.ply"], &["SCENE", "another.ply"]),
+    let bad: [(&str, &[&str]); 12] = [
+        ("--size 0x3", &["--size", "800x600"]),
+        ("--size 99999x3", &["--size"]),
+        ("--camera 0", &["--camera", "--cameras"]),
+        ("--frames x", &["--screenshot, --frames"]),
+        ("--fov NaN", &["--fov"]),
+        ("--background 1,2", &["--background"]),
+        ("--backend cuda", &["--backend", "cuda"]),
+        ("--draw blend", &["--draw", "--time"]),
+        ("--draw paint", &["--draw", "paint"]),
+        ("--nonsense", &["--nonsense"]),
+        ("--cameras out.png", &["out.png"]),
+        ("another.ply", &["SCENE", "another.ply"]),
     ];
-    for (arguments, words) in bad {
-        let mut command = program();
-        command.arg(&scene).args(["--screenshot", out]).args(arguments);
-        refused(&command.output().expect("start"), words);
+    for (options, words) in bad {
+        refused(command(&scene, options).arg("--screenshot").arg(&out), words);
     }
-    let wrong = program().arg(&scene).args(["--screenshot", "a.jpg"]).output().expect("start");
-    refused(&wrong, &["--screenshot", ".png or .exr"]);
-    let frames = program().arg(&scene).args(["--frames", out]).output().expect("start");
-    refused(&frames, &["--orbit"]);
+    refused(&mut command(&scene, "--screenshot a.jpg"), &["--screenshot", ".png or .exr"]);
+    refused(command(&scene, "--frames").arg(&out), &["--orbit"]);
 }
 
+// Metal and DX12 need no file that could be hidden.
+#[cfg(target_os = "linux")]
 #[test]
 fn without_an_adapter_the_cpu_draws_and_gpu_is_refused() {
     let folder = Folder::new();
     let (scene, out) = (folder.join("scene.ply"), folder.join("out.png"));
     write(&scene, &ball(50, 8, [0.5; 3]));
-    let command = |backend: &str| {
-        let mut command = program();
+    let hidden = |backend: &str| {
+        let mut command = command(&scene, "--size 40x30 --backend");
         command.env("VK_DRIVER_FILES", "/nothing").env("VK_ICD_FILENAMES", "/nothing");
-        command.arg(&scene).arg("--screenshot").arg(&out);
-        command.args(["--size", "40x30", "--backend", backend]).output().expect("start")
+        command.args([backend, "--screenshot"]).arg(&out);
+        command
     };
-    // Metal and DX12 need no file that could be hidden.
-    if cfg!(target_os = "linux") {
-        refused(&command("gpu"), &["backend gpu", "no Vulkan"]);
-        let drawn = command("auto");
-        assert!(drawn.status.success(), "{}", said(&drawn));
-        assert!(said(&drawn).contains("the CPU draws"), "{}", said(&drawn));
-        assert_eq!(read_png(&out).size, [40, 30]);
-    }
+    refused(&mut hidden("gpu"), &["backend gpu", "no Vulkan"]);
+    let drawn = run(&mut hidden("auto"));
+    assert!(said(&drawn).contains("the CPU draws"), "{}", said(&drawn));
+    assert_eq!(read_png(&out).size, [40, 30]);
 }
 
+#[cfg(target_os = "linux")]
 #[test]
 fn without_a_display_an_error_message_says_what_to_do() {
-    if cfg!(target_os = "linux") {
-        let folder = Folder::new();
-        let scene = folder.join("scene.ply");
-        write(&scene, &ball(10, 9, [0.5; 3]));
-        let output = program().arg(&scene).output().expect("start");
-        refused(&output, &["no display answers", "WAYLAND_DISPLAY nor DISPLAY", "--screenshot"]);
-        assert!(!said(&output).contains(".rs"), "winit's source is named: {}", said(&output));
-        let nobody = program().env("DISPLAY", ":none").arg(&scene).output().expect("start");
-        refused(&nobody, &["no display answers at DISPLAY=:none", "--screenshot"]);
-    }
+    let folder = Folder::new();
+    let scene = folder.join("scene.ply");
+    write(&scene, &ball(10, 9, [0.5; 3]));
+    let output = command(&scene, "").output().expect("start");
+    refused_with(&output, &["no display answers", "WAYLAND_DISPLAY nor DISPLAY", "--screenshot"]);
+    assert!(!said(&output).contains(".rs"), "winit's source is named: {}", said(&output));
+    let words = ["no display answers at DISPLAY=:none", "--screenshot"];
+    refused(command(&scene, "").env("DISPLAY", ":none"), &words);
 }
 
 /// A checkpoint as numpy's savez writes it.
@@ -303,13 +271,7 @@ fn a_fit_s_folder_shows_its_checkpoint_as_it_shows_the_same_scene() {
     write(&folder.join("a/scene.ply"), &file);
     std::fs::create_dir_all(folder.join("b")).expect("folder");
     write_checkpoint(&folder.join("b/checkpoint.npz"), &file);
-    let draw = |name: &str| {
-        let out = folder.join(&format!("{name}.png"));
-        let arguments = ["--size", "80x60", "--backend", "cpu"];
-        let [a, b, c, d] = arguments;
-        run(&[&folder.join(name), &"--screenshot", &out, &a, &b, &c, &d]);
-        read_png(&out)
-    };
+    let draw = |name: &str| draw(&folder.join(name), "--size 80x60").0;
     let scene = draw("a");
     assert!(scene == draw("b"));
     assert!(scene.rgb.iter().any(|&v| v > 60), "nothing is seen so far from the world's origin");
@@ -323,9 +285,8 @@ fn a_checkpoint_whose_origin_is_not_finite_is_refused() {
         let mut file = ball(10, 14, [0.5; 3]);
         file.origin[1] = origin;
         write_checkpoint(&path, &file);
-        let mut command = program();
-        command.arg(&path).args(["--screenshot", "x.png", "--backend", "cpu"]);
-        refused(&command.output().expect("start"), &["checkpoint.npz", "origin"]);
+        let mut command = command(&path, "--screenshot x.png --backend cpu");
+        refused(&mut command, &["checkpoint.npz", "origin"]);
     }
 }
 
@@ -339,18 +300,11 @@ fn a_small_scene_is_seen_as_a_large_one_is() {
     file.splats.means.as_flattened_mut().iter_mut().for_each(|v| *v *= factor);
     file.splats.scales.as_flattened_mut().iter_mut().for_each(|v| *v += factor.ln());
     write(&small, &file);
-    let draw = |scene: &Path, more: &[&str]| {
-        let out = scene.with_extension("png");
-        let mut arguments: Vec<&dyn AsRef<std::ffi::OsStr>> =
-            vec![&scene, &"--screenshot", &out, &"--size", &"90x60", &"--backend", &"cpu"];
-        arguments.extend(more.iter().map(|word| word as &dyn AsRef<std::ffi::OsStr>));
-        run(&arguments);
-        read_png(&out)
-    };
-    let (large, small_one) = (draw(&scene, &[]), draw(&small, &[]));
+    let draw = |scene: &Path, options: &str| draw(scene, &format!("--size 90x60 {options}")).0;
+    let (large, small_one) = (draw(&scene, ""), draw(&small, ""));
     assert!(large.apart(&small_one).1 < 0.1, "off by {:?}", large.apart(&small_one));
-    // What was asked for stays.
-    assert!(draw(&small, &["--near", "0.01"]).rgb.iter().all(|&v| v == 0), "near is nothing");
+    // An explicit near plane stays.
+    assert!(draw(&small, "--near 0.01").rgb.iter().all(|&v| v == 0), "near is nothing");
 }
 
 #[test]
@@ -358,27 +312,8 @@ fn frames_larger_than_any_texture_are_refused() {
     let folder = Folder::new();
     let scene = folder.join("scene.ply");
     write(&scene, &ball(10, 17, [0.5; 3]));
-    let mut command = program();
-    command.arg(&scene).args(["--time", "1", "--size", "9000x4"]);
-    refused(&command.output().expect("start"), &["--size", "up to 8192", "9000x4"]);
-}
-
-/// The camera of a headless picture, as a folder of cameras has it.
-fn from_camera(scene: &Path, cameras: &Path, number: &str) -> common::Picture {
-    let out = scene.with_extension("png");
-    let arguments: [&dyn AsRef<std::ffi::OsStr>; 9] = [
-        &scene,
-        &"--screenshot",
-        &out,
-        &"--backend",
-        &"cpu",
-        &"--cameras",
-        &cameras,
-        &"--camera",
-        &number,
-    ];
-    run(&arguments);
-    read_png(&out)
+    let mut command = command(&scene, "--time 1 --size 9000x4");
+    refused(&mut command, &["--size", "up to 8192", "9000x4"]);
 }
 
 #[test]
@@ -390,7 +325,9 @@ fn the_file_that_igsr_writes_gives_its_camera() {
     let written = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/cameras.json");
     let own = folder.join("own.json");
     write_cameras(&own, &[camera()]);
-    let (seen, expected) = (from_camera(&scene, &written, "0"), from_camera(&scene, &own, "0"));
+    let from =
+        |cameras: &Path| draw(&scene, &format!("--camera 0 --cameras {}", cameras.display()));
+    let ((seen, _), (expected, _)) = (from(&written), from(&own));
     assert!(expected.rgb.iter().any(|&v| v > 60), "the scene is dark");
     assert!(seen.apart(&expected).0 <= 1, "off by {:?}", seen.apart(&expected));
 }
@@ -401,9 +338,7 @@ fn other_cameras_are_refused_and_say_what_reads_them() {
     let scene = folder.join("scene.ply");
     write(&scene, &ball(10, 15, [0.5; 3]));
     let refuse = |cameras: &Path, words: &[&str]| {
-        let mut command = program();
-        command.arg(&scene).args(["--screenshot", "x.png", "--cameras"]).arg(cameras);
-        refused(&command.output().expect("start"), words);
+        refused(command(&scene, "--screenshot x.png --cameras").arg(cameras), words);
     };
     let model = folder.join("colmap/sparse/0");
     std::fs::create_dir_all(&model).expect("folder");
@@ -436,9 +371,9 @@ fn other_cameras_are_refused_and_say_what_reads_them() {
         std::fs::write(&file, text).expect("cameras");
         refuse(&file, words);
     }
-    // Nobody named them: the scene is shown without.
-    let output = run(&[&scene, &"--screenshot", &folder.join("x.png"), &"--backend", &"cpu"]);
-    assert!(said(&output).contains("no cameras are shown"), "{}", said(&output));
+    // Without --cameras, the scene is shown without cameras.
+    let (_, notes) = draw(&scene, "");
+    assert!(notes.contains("no cameras are shown"), "{notes}");
     let mut tilted = camera();
     tilted.viewmat = DMat4::from_scale(DVec3::splat(2.0)) * tilted.viewmat;
     write_cameras(&file, &[tilted]);
@@ -450,10 +385,8 @@ fn every_format_opens_and_shows_the_scene() {
     let folder = Folder::new();
     let file = ball(400, 13, [0.3, 0.6, 0.5]);
     let draw = |name: &str| {
-        let (scene, out) = (folder.join(name), folder.join("out.png"));
-        write(&scene, &file);
-        run(&[&scene, &"--screenshot", &out, &"--size", &"120x90", &"--backend", &"cpu"]);
-        read_png(&out)
+        write(&folder.join(name), &file);
+        draw(&folder.join(name), "--size 120x90").0
     };
     let expected = draw("scene.ply");
     assert!(expected.rgb.iter().any(|&v| v > 60), "the scene is dark");
@@ -484,17 +417,8 @@ fn both_ways_to_draw_agree_with_the_rasterizer_and_are_timed() {
     let scene = folder.join("scene.ply");
     write(&scene, &ball(3000, 11, [0.5, 0.4, 0.6]));
     for (way, most, mean) in OFF {
-        let output = run(&[
-            &scene,
-            &"--time",
-            &"2",
-            &"--size",
-            &"161x120",
-            &"--background",
-            &"0.2,0.4,0.6",
-            &"--draw",
-            &way,
-        ]);
+        let options = "--time 2 --size 161x120 --background 0.2,0.4,0.6 --draw";
+        let output = run(command(&scene, options).arg(way));
         let text = String::from_utf8_lossy(&output.stdout).into_owned();
         let off: Vec<f64> = text
             .lines()
@@ -530,37 +454,26 @@ fn every_model_of_a_run_is_first_seen_as_a_photo_over_the_fit_s_background() {
     write_cameras(&folder.join("out/cameras.json"), &[camera(), other]);
     let report = r#"{"test": {"protocol": {"background": [1.0, 0.5, 0.25]}}}"#;
     std::fs::write(folder.join("out/report.json"), report).expect("report");
-    let draw = |scene: &Path, more: &[&str]| {
-        let out = folder.join("out.png");
-        let mut arguments: Vec<&dyn AsRef<std::ffi::OsStr>> =
-            vec![&scene, &"--screenshot", &out, &"--size", &"120x80", &"--backend", &"cpu"];
-        arguments.extend(more.iter().map(|word| word as &dyn AsRef<std::ffi::OsStr>));
-        run(&arguments);
-        read_png(&out)
+    let draw = |scene: &str, options: &str| {
+        draw(&folder.join(scene), &format!("--size 120x80 {options}")).0
     };
-    let expected = bytes(&drawn_over(&file, &camera(), [1.0, 0.5, 0.25]));
+    let picture = |rgb: Vec<u8>| Picture { size: [120, 80], rgb };
+    let expected = picture(bytes(&drawn_over(&file, &camera(), [1.0, 0.5, 0.25])));
     for scene in scenes.iter().chain(&["out"]) {
-        let off = draw(&folder.join(scene), &[])
-            .rgb
-            .iter()
-            .zip(&expected)
-            .map(|(a, b)| a.abs_diff(*b))
-            .max();
-        assert!(off <= Some(1), "{scene} is off by {off:?}");
+        let off = draw(scene, "").apart(&expected).0;
+        assert!(off <= 1, "{scene} is off by {off}");
     }
-    // What is asked for goes before.
-    let black = bytes(&drawn(&file, &other));
-    let asked = draw(&folder.join(scenes[1]), &["--camera", "1", "--background", "black"]);
-    let off = asked.rgb.iter().zip(&black).map(|(a, b)| a.abs_diff(*b)).max();
-    assert!(off <= Some(1), "off by {off:?}");
-    let wide = draw(&folder.join(scenes[1]), &["--fov", "120"]);
-    assert!(wide.rgb.iter().zip(&expected).any(|(a, b)| a.abs_diff(*b) > 30), "--fov does nothing");
+    // Options have priority.
+    let black = picture(bytes(&drawn(&file, &other)));
+    let off = draw(scenes[1], "--camera 1 --background black").apart(&black).0;
+    assert!(off <= 1, "off by {off}");
+    assert!(draw(scenes[1], "--fov 120").apart(&expected).0 > 30, "--fov does nothing");
 }
 
 #[test]
 fn a_scene_without_cameras_is_seen_from_above_its_ground() {
     let folder = Folder::new();
-    let (scene, out) = (folder.join("scene.ply"), folder.join("out.png"));
+    let scene = folder.join("scene.ply");
     // A red floor that faces +x, and a green pole on it.
     let mut file = ball(0, 0, [0.0; 3]);
     let mut add = |at: [f32; 3], scales: [f32; 3], color: [f32; 3]| {
@@ -581,8 +494,7 @@ fn a_scene_without_cameras_is_seen_from_above_its_ground() {
         add([0.05 * x as f32, 0.0, 0.0], [-2.6; 3], [0.0, 1.0, 0.0]);
     }
     write(&scene, &file);
-    run(&[&scene, &"--screenshot", &out, &"--size", &"180x180", &"--backend", &"cpu"]);
-    let picture = read_png(&out);
+    let (picture, _) = draw(&scene, "--size 180x180");
     let middle = |channel: usize| {
         let is_it =
             |i: &usize| picture.rgb[3 * i + channel] > 128 && picture.rgb[3 * i + 1 - channel] < 90;
@@ -599,19 +511,18 @@ fn frames_go_into_no_folder_that_is_used() {
     let (scene, frames) = (folder.join("scene.ply"), folder.join("frames"));
     write(&scene, &ball(20, 19, [0.5; 3]));
     std::fs::create_dir_all(&frames).expect("folder");
-    let mut command = program();
-    command.arg(&scene).arg("--frames").arg(&frames).args(["--orbit", "2", "--size", "20x20"]);
-    command.args(["--backend", "cpu"]);
-    // An empty one is as good as a new one.
-    assert!(command.output().expect("start").status.success());
+    let to = |folder: &Path| {
+        let mut command = command(&scene, "--orbit 2 --size 20x20 --backend cpu --frames");
+        command.arg(folder);
+        command
+    };
+    // An empty folder may be used.
+    run(&mut to(&frames));
     let first = std::fs::read(frames.join("0000.png")).expect("a picture");
-    refused(&command.output().expect("start"), &["frames", "is not empty", "--frames"]);
+    refused(&mut to(&frames), &["frames", "is not empty", "--frames"]);
     assert_eq!(std::fs::read(frames.join("0000.png")).expect("a picture"), first);
     std::fs::write(folder.join("file"), "x").expect("file");
-    let mut command = program();
-    command.arg(&scene).arg("--frames").arg(folder.join("file"));
-    command.args(["--orbit", "2", "--backend", "cpu"]);
-    refused(&command.output().expect("start"), &["file", "cannot be made"]);
+    refused(&mut to(&folder.join("file")), &["file", "cannot be made"]);
 }
 
 #[cfg(unix)]
@@ -639,17 +550,19 @@ fn pipes_and_devices_are_refused_at_once() {
             }
             std::thread::sleep(Duration::from_millis(10));
         }
-        refused(&running.wait_with_output().expect("output"), &[name, "is a pipe or a device"]);
+        refused_with(
+            &running.wait_with_output().expect("output"),
+            &[name, "is a pipe or a device"],
+        );
     };
     for pipe in &pipes[..2] {
         refuse(&[pipe], &pipe.file_name().expect("a name").to_string_lossy());
     }
     refuse(&[&scene, &"--cameras", &pipes[2]], "cameras.json");
     refuse(&[&"/dev/zero"], "/dev/zero");
-    // Cameras that nobody named are left out.
-    let out = folder.join("out.png");
-    let output = run(&[&scene, &"--screenshot", &out, &"--size", &"20x20", &"--backend", &"cpu"]);
-    assert!(said(&output).contains("no cameras are shown"), "{}", said(&output));
+    // Without --cameras, the pipe is skipped.
+    let (_, notes) = draw(&scene, "--size 20x20");
+    assert!(notes.contains("no cameras are shown"), "{notes}");
 }
 
 #[test]
@@ -660,9 +573,8 @@ fn a_file_of_cameras_that_is_too_large_is_not_read() {
     write_cameras(&cameras, &[camera()]);
     let file = std::fs::File::options().append(true).open(&cameras).expect("open");
     file.set_len((64 << 20) + 1).expect("size");
-    let mut command = program();
-    command.arg(&scene).args(["--screenshot", "x.png", "--cameras"]).arg(&cameras);
-    refused(&command.output().expect("start"), &["cameras.json", "67108865 bytes"]);
+    let mut command = command(&scene, "--screenshot x.png --cameras");
+    refused(command.arg(&cameras), &["cameras.json", "67108865 bytes"]);
 }
 
 /// A ball of 3000 splats at three levels, in `levels` of the folder.
@@ -675,9 +587,8 @@ fn ball_in_levels(folder: &Folder) -> std::path::PathBuf {
 }
 
 /// "N of M splats, in C of D cells; H are in memory.": all numbers.
-fn numbers(output: &std::process::Output) -> Vec<usize> {
-    let text = said(output);
-    let line = text.lines().find(|line| line.contains("cells")).expect("a line of cells");
+fn numbers(notes: &str) -> Vec<usize> {
+    let line = notes.lines().find(|line| line.contains("cells")).expect("a line of cells");
     line.split(|c: char| !c.is_ascii_digit()).filter_map(|word| word.parse().ok()).collect()
 }
 
@@ -685,25 +596,17 @@ fn numbers(output: &std::process::Output) -> Vec<usize> {
 fn levels_are_drawn_within_a_budget_and_look_better_with_more() {
     let folder = Folder::new();
     let levels = ball_in_levels(&folder);
-    let draw = |scene: &Path, more: &[&str]| {
-        let out = folder.join("out.png");
-        let size: [&dyn AsRef<std::ffi::OsStr>; 7] =
-            [&scene, &"--screenshot", &out, &"--size", &"120x90", &"--backend", &"cpu"];
-        let more = more.iter().map(|word| word as &dyn AsRef<std::ffi::OsStr>);
-        let output = run(&size.into_iter().chain(more).collect::<Vec<_>>());
-        (read_png(&out), output)
-    };
-    // One view for all: the coarse scenes have another middle.
-    write_cameras(&folder.join("cameras.json"), &[camera()]);
+    // One view for all: the coarse scenes have another center.
     let cameras = folder.join("cameras.json");
-    let cameras = ["--cameras", cameras.to_str().expect("a path")];
-    let (whole, _) = draw(&folder.join("scene.ply"), &cameras);
+    write_cameras(&cameras, &[camera()]);
+    let draw = |scene: &Path, options: &str| {
+        draw(scene, &format!("--size 120x90 --cameras {} {options}", cameras.display()))
+    };
+    let (whole, _) = draw(&folder.join("scene.ply"), "");
     let mut last = f64::INFINITY;
     for budget in [300usize, 1500, 4000] {
-        let text = budget.to_string();
-        let words = [&cameras[..], &["--budget", &text]].concat();
-        let (picture, output) = draw(&levels, &words);
-        let [drawn, all, cells, of, held] = numbers(&output)[..] else { panic!("five numbers") };
+        let (picture, notes) = draw(&levels, &format!("--budget {budget}"));
+        let [drawn, all, cells, of, held] = numbers(&notes)[..] else { panic!("five numbers") };
         assert!(drawn <= budget && held <= budget, "{drawn} and {held} of {budget}");
         assert!(drawn * 2 > budget.min(3000), "{drawn} of {budget}");
         assert_eq!((all, cells), (3000, of));
@@ -713,26 +616,25 @@ fn levels_are_drawn_within_a_budget_and_look_better_with_more() {
     }
     // The budget has room for all, but for what SOG rounds.
     assert!(last < 2.0, "{last}");
-    let (index, _) = draw(&levels.join("lod-meta.json"), &cameras);
+    let (index, _) = draw(&levels.join("lod-meta.json"), "");
     assert!(index.apart(&whole).1 < 2.0);
 }
 
 #[test]
-fn budgets_and_levels_that_cannot_be_are_told() {
+fn wrong_budgets_and_broken_levels_are_refused() {
     let folder = Folder::new();
     let levels = ball_in_levels(&folder);
     let out = folder.join("out.png");
-    let said = |scene: &Path, more: &[&str], words: &[&str]| {
-        let mut command = program();
-        command.arg(scene).arg("--screenshot").arg(&out).args(["--backend", "cpu"]).args(more);
-        refused(&command.output().expect("splat-view starts"), words);
+    let refuse = |scene: &Path, options: &str, words: &[&str]| {
+        let mut command = command(scene, options);
+        refused(command.args(["--backend", "cpu", "--screenshot"]).arg(&out), words);
         assert!(!out.exists());
     };
-    said(&folder.join("scene.ply"), &["--budget", "100"], &["--budget", "igsr convert --lod"]);
-    said(&levels, &["--budget", "0"], &["--budget", "from 1 to"]);
-    said(&levels, &["--budget", "1"], &["--budget", "of 1 splats", "give more"]);
+    refuse(&folder.join("scene.ply"), "--budget 100", &["--budget", "igsr convert --lod"]);
+    refuse(&levels, "--budget 0", &["--budget", "from 1 to"]);
+    refuse(&levels, "--budget 1", &["--budget", "of 1 splats", "give more"]);
     std::fs::remove_dir_all(levels.join("0_0")).expect("gone");
-    said(&levels, &[], &["0_0"]);
+    refuse(&levels, "", &["0_0"]);
     std::fs::write(levels.join("lod-meta.json"), "{}").expect("an index");
-    said(&levels, &[], &["lod-meta.json", "lodLevels"]);
+    refuse(&levels, "", &["lod-meta.json", "lodLevels"]);
 }

@@ -184,8 +184,7 @@ impl BlockStep {
     }
 }
 
-/// Adam's step (Kingma and Ba, 2015, algorithm 1): the new values, first and second moments. Operations
-/// are not fused, so that bits are the same on every machine.
+/// Adam's step (Kingma and Ba, 2015, algorithm 1), not fused, so that bits agree on every machine.
 #[inline(always)]
 pub(super) fn step<S: Simd>(
     [value, first, second]: [Lanes<S>; 3],
@@ -234,8 +233,7 @@ impl WithSimd for Adam<'_> {
     }
 }
 
-/// Numbers with their first and second moments as whole vectors and a rest that fills none: to read a
-/// part of a vector is a call.
+/// Values and moments as whole vectors and a rest; reading a part of a vector is slow.
 pub(super) struct StateVectors<'a, S: Simd> {
     s: S,
     whole: [&'a mut [S::f32s]; 3],

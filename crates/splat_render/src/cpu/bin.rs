@@ -34,9 +34,8 @@ impl ChunkTiles {
         self.counts.push(0);
     }
 
-    /// Appends the tiles that a visible splat touches: per row of tiles, the exact span of its
-    /// ellipse {alpha >= ALPHA_MIN} within the band of that row's pixel centers, a little widened
-    /// against rounding.
+    /// Appends the tiles of a visible splat: per row of tiles, the span of its ellipse {alpha >=
+    /// ALPHA_MIN} within the band of that row's pixel centers, slightly widened against rounding.
     pub fn push(&mut self, splat: &Splat2d, width: u32, height: u32) {
         let before = self.tiles.len();
         self.push_tiles(splat, width, height);
@@ -52,9 +51,8 @@ impl ChunkTiles {
         let reach = splat.reach * (1.0 + 1e-5) + 1e-5;
         let slack = |radius: f32, center: f32| 1e-2 + 4e-6 * (radius + center.abs());
         let (slack_x, slack_y) = (slack(rx, mx), slack(ry, my));
-        // Tiles with a pixel center in [low, high]. A tile's last pixel center is half a pixel before its
-        // end, hence the -0.5, and the +0.5 for the tile that ends there. After the clamp, truncation
-        // rounds down.
+        // Tiles with a pixel center in [low, high]; a tile's first and last center are half a pixel
+        // inside. After the clamp, truncation rounds down.
         let tiles_of = |low: f32, high: f32, count: u32| {
             let of = |x: f32| (x / tile).clamp(0.0, (count - 1) as f32) as u32;
             of(low + 0.5)..=of(high - 0.5)
@@ -104,24 +102,20 @@ const GROUP: usize = 1 << 14;
 pub(super) struct Bins {
     /// `[tiles + 1]` start of each tile's list.
     pub starts: Vec<u32>,
-    /// Splat ids by (tile, depth, index); slots during the sort. Atomic because tasks write to
-    /// interleaved places.
+    /// Splat ids by (tile, depth, index); slots during the sort. Atomic, since tasks interleave.
     pub splats: Vec<AtomicU32>,
     /// `[N + 1]` start of each splat's slots: a place per pair, splat-major.
     slots: Vec<u32>,
     /// Position in `splats` of each slot. While they are sorted, the slot's splat.
     position_from_slot: Vec<AtomicU32>,
-    /// By group of consecutive splats and by tile: first the number of pairs, then the position of the
-    /// group's next pair.
+    /// By group of splats and by tile: the number of pairs, then the position of the next pair.
     cursors: Vec<u32>,
 }
 
 impl Bins {
-    /// Sorts the chunks' tiles. `depth(i)` is called only for splats that touch a tile.
-    ///
-    /// One task per thread puts splats into tiles in memory order, since each task visits all tiles. Then
-    /// each tile's list, which fits into the cache, is sorted separately. All keys differ, so the result
-    /// does not depend on the tasks.
+    /// Sorts the chunks' tiles. `depth(i)` is called only for splats that touch a tile. Tasks first put
+    /// splats into tiles in memory order, then sort each tile's list, which fits into the cache. All keys
+    /// differ, so the result does not depend on the tasks.
     pub fn fill(
         &mut self,
         chunks: &[ChunkTiles],

@@ -1,5 +1,4 @@
-//! A block of splats as structure of arrays, so that one vector holds the same number of several
-//! splats. It stays in the cache.
+//! A block of splats as structure of arrays, one splat per vector lane. It stays in the cache.
 
 use pulp::Simd;
 
@@ -146,8 +145,7 @@ impl ColorRows {
         Vec3s::new(rows[0].get(s, at), rows[1].get(s, at), rows[2].get(s, at))
     }
 
-    /// Takes the first `used` coefficients of each of the splats `ids` of the block that begins with
-    /// splat `first`; `coeffs` has `stride` for each splat.
+    /// Takes the first `used` of `stride` coefficients of the splats `ids` of the block at `first`.
     #[inline(always)]
     pub fn take(
         &mut self,

@@ -42,8 +42,7 @@ pub(super) fn exp<S: Simd>(x: Lanes<S>) -> Lanes<S> {
     x.eq(x).select(y, x)
 }
 
-/// ln x of a positive normal number, relative error below 1e-7. Anything else gives a number
-/// without meaning: the caller has looked.
+/// ln x of a positive normal number, relative error below 1e-7; undefined for other numbers.
 #[inline(always)]
 pub(super) fn ln<S: Simd>(x: Lanes<S>) -> Lanes<S> {
     // Of Cephes' logf: (ln(1 + f) - f + f^2 / 2) / f^3 on sqrt(1/2) <= 1 + f < sqrt(2), from the

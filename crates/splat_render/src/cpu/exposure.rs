@@ -5,8 +5,7 @@ use rayon::prelude::*;
 use super::rasterize::Planes;
 use crate::stages::{Exposure, ExposureGradients, Image};
 
-/// Pixels per task: sums are taken by task and added in order, so that they do not depend on the
-/// threads.
+/// Pixels per task. Tasks' sums are added in order, so that they do not depend on the threads.
 const PART: usize = 1 << 14;
 /// Sums that run side by side, which the compiler makes vectors of.
 const LANES: usize = 16;
@@ -44,8 +43,7 @@ impl Exposed {
         }
     }
 
-    /// Replaces the gradients of the corrected colors by the picture's, sets `self.v_alpha`, and returns
-    /// the gradients of gain and offset.
+    /// Turns the corrected colors' gradients into the picture's; returns gain's and offset's.
     pub fn backward(
         &mut self,
         image: &Planes,

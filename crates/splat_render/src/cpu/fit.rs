@@ -1,5 +1,4 @@
-//! The CPU as a fitting device: project_backward and adam run fused, a block of splats at a time, so
-//! that no gradient array of the parameters' size exists.
+//! Fitting on the CPU: project_backward and adam run fused on blocks, which saves gradient arrays.
 
 use rayon::prelude::*;
 
@@ -202,9 +201,8 @@ struct Scratch {
 }
 
 impl CpuFit {
-    /// Sets the number of steps that colors of unseen splats may wait, by default
-    /// [`COLOR_WAIT`](crate::fit::COLOR_WAIT); with 1, every step updates all colors. The bits do not
-    /// change.
+    /// Limits the steps that colors of unseen splats wait, by default to
+    /// [`COLOR_WAIT`](crate::fit::COLOR_WAIT). The bits do not change.
     pub fn with_color_wait(self, steps: usize) -> Self {
         Self { steps: WaitingSteps::at_most(steps), ..self }
     }

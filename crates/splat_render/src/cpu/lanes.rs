@@ -1,7 +1,5 @@
-//! Arithmetic on lanes: numbers and 3-vectors of several splats, one splat per vector lane.
-//!
-//! Operators keep formulas readable. They are always-inlined functions, not closures, for the reason
-//! given in `simd.rs`.
+//! Arithmetic on lanes: numbers and 3-vectors, one splat per vector lane. Operators keep formulas
+//! readable; they are always-inlined functions, not closures (see `simd.rs`).
 
 use std::ops::{Add, BitAnd, Div, Mul, Neg, Not, Sub};
 

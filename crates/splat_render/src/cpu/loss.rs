@@ -1,8 +1,7 @@
 //! loss: L1 and D-SSIM of a picture against a photo, with the picture's gradient.
 //!
-//! One sweep over the rows: as soon as the window around a row is there, SSIM's slopes in it are
-//! computed, and as soon as there are slopes around a row, its gradient. Only the rows that windows
-//! still reach are kept, in rings that fit into the cache.
+//! One sweep over the rows: SSIM's slopes of a row follow once its window is complete, and its gradient
+//! once the slopes around it are. Rings that fit into the cache keep the rows within reach.
 
 use std::ops::Range;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -19,8 +18,7 @@ use crate::constants::SSIM_C;
 use crate::stages::{self, Image};
 use crate::target::Target;
 
-/// Approximate rows per task. The 2 [`HALF`] extra rows that it reads on either side cost a tenth of
-/// this, and many threads get several tasks each.
+/// Approximate rows per task: far more than the 4 [`HALF`] extra rows that it reads.
 const BAND: usize = 96;
 
 /// The loss's gradient and scratch memory, kept from step to step.
@@ -49,11 +47,9 @@ struct Band<'a> {
 
 /// Maps of a ring of pictures: the picture and the photo, zero beyond them.
 const PICTURES: usize = 2;
-/// Maps of a ring of slopes: by how much the loss falls with the filtered x, how it grows with half
-/// of the filtered xx, and how it falls with the filtered xy, through SSIM.
+/// Maps of a ring of slopes of the loss by the filtered x (negated), xx (halved) and xy (negated).
 const SLOPES: usize = 3;
-/// Filtered maps that SSIM is made of: x, y, xx + yy and xy. It takes the two variances only as a
-/// sum.
+/// Filtered maps for SSIM: x, y, xx + yy and xy; only the sum of the variances is needed.
 const MEANS: usize = 4;
 
 /// A band's scratch memory. Rings have all rows of a vector side by side.
@@ -61,8 +57,7 @@ struct Memory<'a, V> {
     vectors: usize,
     pictures: &'a mut [[V; SLOTS]],
     slopes: &'a mut [[V; SLOTS]],
-    /// [`STEP`] rows of each of [`MEANS`] maps, filtered along the columns, with [`HALF`] vectors
-    /// before and after each row.
+    /// [`STEP`] rows of [`MEANS`] maps, filtered along columns, padded by [`HALF`] vectors.
     filtered: &'a mut [V],
     gradient: &'a mut [V],
     /// A row as it lies in a picture, zero beyond its width.
@@ -161,9 +156,8 @@ impl WithSimd for Band<'_> {
     }
 }
 
-/// The sweep. It counts rows from the first one that the band's windows reach, 2 [`HALF`] before
-/// it. The step at row `at` takes in rows from there on, has slopes of those HALF rows before them,
-/// and the gradient of those HALF rows before these.
+/// The sweep. Rows count from the first one within reach, 2 [`HALF`] before the band. The step at row
+/// `at` takes in rows from `at` on, slopes of rows HALF before, and gradients 2 HALF before.
 impl Band<'_> {
     /// The picture's row that a sweep's row is, if there is one.
     #[inline(always)]
@@ -202,8 +196,7 @@ impl Band<'_> {
         }
     }
 
-    /// Filters the pictures and puts the slopes of SSIM into their ring; returns the weighted sum of
-    /// SSIM over those rows that are the band's own.
+    /// Computes the next rows of slopes; returns the weighted sum of SSIM over the band's rows.
     #[inline(always)]
     fn slopes<S: Simd>(&self, s: S, memory: &mut Memory<'_, S::f32s>, at: usize) -> f64 {
         let vectors = memory.vectors;
@@ -259,8 +252,7 @@ impl Band<'_> {
         total
     }
 
-    /// Filters the slopes and writes the gradient of those rows that are the band's own; returns the
-    /// weighted sum of |x - y| over them.
+    /// Writes the next rows of the gradient; returns the weighted sum of |x - y| over the band's rows.
     #[inline(always)]
     fn gradient<S: Simd>(&mut self, s: S, memory: &mut Memory<'_, S::f32s>, at: usize) -> f64 {
         let (vectors, width) = (memory.vectors, self.photo.width as usize);
@@ -339,8 +331,7 @@ impl Band<'_> {
     }
 }
 
-/// Computes `N` vectors of a row of slopes from vector `k` on; `unit` is the weight of SSIM. Adds w SSIM
-/// to `sum`.
+/// Computes `N` vectors of slopes from vector `k` on, at SSIM's weight `unit`; adds w SSIM to `sum`.
 #[inline(always)]
 fn slopes_of<S: Simd, const N: usize>(
     s: S,

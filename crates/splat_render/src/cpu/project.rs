@@ -67,8 +67,7 @@ pub(super) struct Splats<S: Simd> {
     pub opacity: Lanes<S>,
     /// Derivative of the opacity with respect to the parameter as given.
     pub opacity_slope: Lanes<S>,
-    /// Whether scales and opacity were given as finite numbers. A log-scale of -inf or a logit of +inf
-    /// counts as invalid, although its scale or opacity is finite.
+    /// Whether scales and opacity were given as finite numbers; -inf and +inf count as invalid.
     pub given: Mask<S>,
 }
 
@@ -82,8 +81,7 @@ pub(super) fn sigmoid<S: Simd>(logit: Lanes<S>) -> (Lanes<S>, Lanes<S>) {
 }
 
 impl<S: Simd> Splats<S> {
-    /// The vector `at` of a block's splats, their opacities multiplied by `compensation`; scales
-    /// are logarithms and opacities logits if `raw`.
+    /// The vector `at` of a block, opacities times `compensation`; raw parameters if `raw`.
     #[inline(always)]
     pub fn load(s: S, rows: &SplatRows, at: usize, raw: bool, compensation: f32) -> Self {
         let (scales, opacity) = (get3(&rows.scales, s, at), rows.opacities.get(s, at));
@@ -290,8 +288,7 @@ impl ProjectBlock {
         })
     }
 
-    /// Projects the shapes of the splats `ids` of the block that begins with splat `first`, with
-    /// opacities multiplied by `compensation`. Returns the ids of the visible ones.
+    /// Projects the shapes of the splats `ids`, opacities times `compensation`; returns the visible ones.
     pub fn shapes(
         &mut self,
         view: &View,
@@ -305,8 +302,7 @@ impl ProjectBlock {
         self.numbers
     }
 
-    /// The colors of the splats that [`ProjectBlock::shapes`] returned, of a block that begins with
-    /// splat `first` of `colors`.
+    /// Computes the colors of the splats that [`ProjectBlock::shapes`] returned.
     pub fn colors(&mut self, view: &View, colors: Colors<'_, f32>, first: usize) {
         dispatch(Paint { block: self, view, colors, first });
     }
@@ -435,8 +431,7 @@ impl ProjectBlock {
                     let (dir, _) = direction(view, get3(&self.visible_t, s, at));
                     let basis = sh::basis(degree, [dir.x, dir.y, dir.z]);
                     let color = sh_color(degree, &basis, &self.coeffs, at);
-                    // Before the cut at zero, which would hide a poisoned coefficient here and let
-                    // it out in the gradients.
+                    // Before the clamp at zero, which would hide an invalid coefficient.
                     self.finite.set(at, color.is_finite().keep(one));
                     let zero = one.all(0.0);
                     let Vec3s { x, y, z } = color;

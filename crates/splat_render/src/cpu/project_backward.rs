@@ -1,5 +1,4 @@
-//! project_backward: gradients of the 2D splats to gradients of the splats and the camera, f32, a
-//! block of splats at a time, one splat per lane.
+//! project_backward in f32: a block of splats at a time, one splat per lane.
 
 use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
@@ -222,8 +221,7 @@ impl BackwardBlock {
         self.v_opacities2d.0[at] = v.v_opacity;
     }
 
-    /// Writes the gradients of the splats that were pushed, colors apart, to `out`, the block's part
-    /// of the arrays, and returns the camera's. The block begins with splat `first` of `stage.splats`.
+    /// Writes the gradients of the pushed splats except colors to `out`; returns the camera's.
     pub fn run(&mut self, stage: &Backward<'_>, first: usize, out: SplatSlices<'_>) -> VCamera {
         dispatch(Run { block: self, stage, first, out })
     }
@@ -399,9 +397,8 @@ impl BackwardBlock {
         v_t = v_t + Vec3s::new(v_x, v_y, v_z);
         let v_mean = to_world([row_x, row_y, row_z], v_t);
 
-        // A finite picture can still have gradients that overflow (a coefficient of 1e38, or -inf
-        // behind the cut of the color). All of that splat's are zero then: they must not reach the
-        // camera or, through Adam's moments, later steps.
+        // A finite picture can still have gradients that overflow. All of that splat's become zero: they
+        // must not reach the camera or, through Adam's moments, later steps.
         let mut finite = Finite::new(v_opacity);
         finite.add3(v_color);
         finite.add3(v_mean);

@@ -1,5 +1,4 @@
-//! rasterize_backward: image gradients to per-splat 2D gradients, front to back, so that it rounds
-//! and stops exactly as the forward pass did.
+//! rasterize_backward: front to back, so that it rounds and stops exactly as the forward pass.
 
 use std::sync::atomic::AtomicU32;
 
@@ -182,8 +181,7 @@ pub(super) fn rasterize_backward_tiles<const N: usize>(
     let columns = width.div_ceil(SIDE);
     sums.resize(bins.splats.len(), [0.0; N]);
 
-    // Tasks are tiles, each with the part of `sums` that is its own: rows of tiles are too few for
-    // many threads and hold very different numbers of pairs.
+    // One task per tile: rows of tiles are too few and too uneven for many threads.
     let mut tiles = Vec::with_capacity(bins.starts.len());
     let mut rest = sums.as_mut_slice();
     for tile in 0..bins.starts.len() - 1 {
@@ -211,8 +209,7 @@ pub(super) fn rasterize_backward_tiles<const N: usize>(
     });
 }
 
-/// Sums a splat's pairs, at these positions in tile order, and converts whitened moments to 2D gradients,
-/// with the center's absolute gradient if `N` includes it.
+/// Sums a splat's pairs and converts whitened moments to 2D gradients (see `N`).
 #[inline(always)]
 pub(super) fn gather<const N: usize>(
     splat: &TileSplat,

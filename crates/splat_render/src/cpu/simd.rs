@@ -61,8 +61,7 @@ pub(super) fn prefetch<T>(value: &T) {
     let _ = value;
 }
 
-/// 2^-d for d >= 0, relative error below 1.2e-7 (1.4e-8 of the polynomial, the rest rounding).
-/// Above 126 it returns about 2^-126.
+/// 2^-d for d >= 0, relative error below 1.2e-7; about 2^-126 above 126.
 #[inline(always)]
 pub fn exp2_of_minus<S: Simd>(s: S, d: S::f32s) -> S::f32s {
     // Adding 1.5 * 2^23 leaves the nearest integer in the low mantissa bits.
@@ -108,8 +107,7 @@ mod tests {
     };
 
     thread_local! {
-        /// Lanes to run with in place of the machine's own, 0 for those. Each thread has its own:
-        /// other tests run at the same time.
+        /// Overrides the number of lanes in a thread; 0 for the machine's.
         pub static LANES: Cell<usize> = const { Cell::new(0) };
     }
 
@@ -159,8 +157,7 @@ mod tests {
         most / largest
     }
 
-    /// Machines with other vector widths must draw the same: 16 lanes (AVX-512), 8 (AVX2), 4 (NEON) and
-    /// 1, computed here without their instructions.
+    /// All vector widths must draw the same: 16 (AVX-512), 8 (AVX2), 4 (NEON) and 1 lanes.
     #[test]
     fn every_vector_width_draws_the_same() {
         let mut rng = rand_pcg::Pcg64::seed_from_u64(6);

@@ -19,8 +19,7 @@ pub(super) const STEP: usize = 4;
 pub(super) const REACH: usize = STEP + 2 * HALF;
 /// Rows that a ring keeps: at least [`REACH`], a multiple of [`STEP`], and a power of two.
 pub(super) const SLOTS: usize = 16;
-/// Side of the blocks in which a row's values are put into another order, as a [`Mat4`], which has
-/// instructions for it.
+/// Side of the blocks in which rows are transposed, as a [`Mat4`].
 const BLOCK: usize = 4;
 /// Floats of the widest vectors.
 const WIDEST: usize = 16;
@@ -49,8 +48,7 @@ pub(super) fn vectors_of_row<S: Simd>(width: usize) -> usize {
     width.div_ceil(S::F32_LANES).max(HALF)
 }
 
-/// Spreads a row that lies as in a picture, a whole number of vectors, over the parts: the vectors
-/// are `stride` floats apart in `to`.
+/// Spreads a row in picture order over the parts; vectors are `stride` floats apart in `to`.
 #[inline(always)]
 pub(super) fn spread<S: Simd>(row: &[f32], to: &mut [f32], stride: usize) {
     let vectors = row.len() / S::F32_LANES;
@@ -109,8 +107,7 @@ fn blocks(vectors: usize) -> impl Iterator<Item = usize> {
     (0..vectors.div_ceil(BLOCK)).map(move |block| (block * BLOCK).min(vectors - BLOCK))
 }
 
-/// Fills the [`HALF`] vectors before and after a row with the neighboring parts' values, zero beyond the
-/// picture.
+/// Fills the padding of a row with the neighboring parts' values, zero beyond the picture.
 #[inline(always)]
 pub(super) fn fill_ends<S: Simd>(s: S, row: &mut [S::f32s]) {
     const INDEX: [f32; WIDEST] = {

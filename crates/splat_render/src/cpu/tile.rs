@@ -14,8 +14,7 @@ use crate::constants::TILE;
 pub(super) const SIDE: usize = TILE as usize;
 pub(super) const PIXELS: usize = SIDE * SIDE;
 
-/// Splats that are looked up together, and between two looks at which of a tile's vectors still take
-/// light.
+/// Splats per batch; after each batch, stopped vectors are dropped.
 pub(super) const BATCH: usize = 16;
 
 /// sqrt(log2(e) / 2): scales a factor so that exp(-sigma) = 2^-(u^2 + v^2).
@@ -79,8 +78,7 @@ impl Place {
 }
 
 impl Pixels {
-    /// Transmittance before the first splat: 1, and negative, as if stopped, beyond the rows and
-    /// columns that the picture has.
+    /// Initial transmittance: 1, and negative (stopped) outside the picture.
     #[inline(always)]
     pub fn clear(rows: usize, columns: usize, lanes: usize) -> Self {
         let mut pixels = Self([1.0; PIXELS]);
@@ -129,8 +127,7 @@ pub(super) struct Centers {
     y: [f32; 4 * WIDEST],
     /// y of the rows' pixel centers.
     rows: [f32; SIDE],
-    /// For each block of a row of blocks, the bits in [`Vectors`] of those blocks below it that hold
-    /// the rows of a vector's lanes.
+    /// For each block of the top row, the bits in [`Vectors`] of the blocks below it.
     bits: [u32; 4 * WIDEST],
     /// x of the first pixel center.
     left: f32,
@@ -195,16 +192,13 @@ impl TileSplat {
     }
 }
 
-/// One bit per vector of a tile, in the order of [`Pixels`]: vector k is bit k % 64 of word k / 64. There
-/// is more than one word only for vectors of fewer than four lanes.
+/// One bit per vector of a tile, in the order of [`Pixels`]; one word for at least four lanes.
 pub(super) type Vectors = [u64; PIXELS / 64];
 
-/// Pixels of a tile that a batch of splats may reach: the first half of both rasterize stages. Work that
-/// does not depend on a pixel's state is done for the whole batch in short loops, because processors
-/// cannot reorder it ahead while a pixel waits for the previous splat.
+/// Pixels of a tile that a batch of splats may reach: the first half of both rasterize stages, in short
+/// loops over the batch, since it does not depend on the pixels' state.
 pub(super) struct Reached {
-    /// Copies of the splats, since they lie anywhere in memory: asked for together, they are waited
-    /// for once.
+    /// Copies of the splats, fetched together because they are scattered in memory.
     pub splats: [TileSplat; BATCH],
     /// Each splat's end in the arrays of vectors.
     pub ends: [usize; BATCH],
@@ -241,8 +235,7 @@ impl Reached {
         })
     }
 
-    /// Takes the next splats of a tile's list and finds their vectors within `live`; returns the number
-    /// of splats.
+    /// Finds the vectors of the next splats within `live`; returns the number of splats.
     #[inline(always)]
     pub fn find<S: Simd, const OFFSETS: bool>(
         &mut self,
@@ -349,8 +342,7 @@ fn reach<S: Simd>(s: S, splat: &TileSplat, centers: &Centers) -> Vectors {
     reached
 }
 
-/// Sets the bits of the vectors in which some pixel has not stopped (transmittance above zero);
-/// false if there is none.
+/// Marks the vectors with a pixel that has not stopped; false if there is none.
 #[inline(always)]
 pub(super) fn live_vectors<S: Simd>(s: S, t: &[S::f32s], live: &mut Vectors) -> bool {
     let zero = s.splat_f32s(0.0);

@@ -1,6 +1,5 @@
-//! Colors that wait: a step leaves a splat's colors as they are and keeps their gradient, and when the
-//! splat is next projected, that step and all that followed without a gradient are done in one go. So
-//! colors and moments of splats out of sight are neither read nor written; see `fit_device::waiting`.
+//! Colors that wait: a step keeps a splat's color gradient, and all waiting steps are done in one go when
+//! the splat is next projected (see `fit_device::waiting`). This saves memory traffic for unseen splats.
 
 use pulp::{Simd, WithSimd};
 
@@ -74,8 +73,7 @@ impl ColorBlock {
         })
     }
 
-    /// Does all steps that the splats `ids` of a block wait for. `arrays` are its colors with their
-    /// first and second moments.
+    /// Does all waiting steps of the splats `ids`; `arrays` are colors, first and second moments.
     pub fn run(
         &mut self,
         plan: &ColorPlan<'_>,

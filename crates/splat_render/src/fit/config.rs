@@ -56,15 +56,13 @@ pub struct FitConfig {
     /// Learning-rate multiplier for the first half of the steps; decays to 1, except for the centers,
     /// whose rate has its own decay. See [`FitConfig::rates_at`].
     pub rate_scale: f32,
-    /// Part of the splats that a step leaves out at random, growing from none in the first step to
-    /// this in the last (DropGaussian).
+    /// Final fraction of dropped splats; grows linearly from 0 (DropGaussian).
     pub dropout: f32,
     /// How cameras are fitted, or None: they are taken as exact.
     pub cameras: Option<CameraConfig>,
     /// Whether a gain and an offset per channel of each photo are fitted; see [`super::Exposures`].
     pub exposures: bool,
-    /// Whether the first steps are on photos of a fraction of their size; see
-    /// [`FitConfig::reduction`].
+    /// Whether the first steps use reduced photos; see [`FitConfig::reduction`].
     pub coarse_to_fine: bool,
     /// Initial weight of the depth loss; see [`FitConfig::depth_weight_at`].
     pub depth_weight: f32,
@@ -117,13 +115,9 @@ const DEPTH_DECAY: f64 = 0.01;
 const REFINE: (u32, u32) = (300, 100);
 
 impl FitConfig {
-    /// Factor by which a step (from 0) reduces both sides of photos: a power of two. Each factor lasts
-    /// equally many steps, and the last seven tenths of the steps use 1.
-    ///
-    /// A step's cost grows with pixels and splats, and few splats show no detail of the photos (Chen et
-    /// al., "DashGaussian", 2025, section 3.2).
-    ///
-    /// `longest` is the longest side of all photos, in pixels.
+    /// Factor by which a step (from 0) reduces both sides of photos: a power of two; 1 from 30 % of the
+    /// steps on. Fewer pixels are faster, and few splats show no detail (Chen et al., "DashGaussian",
+    /// 2025, section 3.2). `longest` is the longest side of all photos, in pixels.
     pub fn reduction(&self, step: u32, longest: u32) -> u32 {
         let halvings = (longest / COARSE_SIDE).checked_ilog2().unwrap_or(0).min(MOST_HALVINGS);
         let progress = f64::from(step) / f64::from(self.steps);
@@ -134,10 +128,8 @@ impl FitConfig {
         1 << halvings.saturating_sub(done)
     }
 
-    /// Adam's rates at a step (from 0) for a scene of this extent.
-    ///
-    /// 3DGS's rates are for 30 000 steps. A tenth of these is too short for splats to reach their places:
-    /// large steps take them there, and small steps at the end settle them.
+    /// Adam's rates at a step (from 0) for a scene of this extent. 3DGS's rates are for 30 000 steps;
+    /// shorter fits need larger steps first and small ones at the end.
     pub fn rates_at(&self, step: u32, extent: f32) -> Rates {
         let progress = f64::from(step) / f64::from(self.steps);
         let decay = f64::from(self.means_decay).powf(progress) as f32;
@@ -155,10 +147,7 @@ impl FitConfig {
     }
 
     /// Size of MCMC's noise on centers at a step (from 0) for a scene of this extent; 0 for other
-    /// controls.
-    ///
-    /// In units of 3DGS's rate, not of the rate in use: with larger steps, larger noise would leave
-    /// centers off their surfaces.
+    /// controls. In units of 3DGS's rate: larger noise would leave centers off their surfaces.
     pub(super) fn noise_at(&self, step: u32, extent: f32) -> f32 {
         match self.density {
             DensityControl::Mcmc => {
@@ -168,9 +157,8 @@ impl FitConfig {
         }
     }
 
-    /// Weight of the depth loss at a step (from 0): decays exponentially to a hundredth. Depths give a
-    /// start, but are less exact than photos (Kerbl et al., "A Hierarchical 3D Gaussian Representation",
-    /// 2024).
+    /// Weight of the depth loss at a step (from 0); decays exponentially to a hundredth (Kerbl et al., "A
+    /// Hierarchical 3D Gaussian Representation", 2024).
     pub fn depth_weight_at(&self, step: u32) -> f32 {
         let progress = f64::from(step) / f64::from(self.steps);
         self.depth_weight * DEPTH_DECAY.powf(progress) as f32

@@ -19,8 +19,7 @@ use crate::target::Target;
 const ADAM: (f64, f64, f64) = (0.9, 0.99, 1e-15);
 /// Final rate of Adam as a fraction of the initial rate.
 const DECAY: f64 = 0.03;
-/// The rates at the start add up to this over the rounds of a fit, in logarithms of gain and units of
-/// color: with the decay, exposures get a bit more than a quarter as far, three stops.
+/// Sum of the initial rates over the rounds of a fit; with the decay, exposures move up to three stops.
 const REACH: f64 = 3.5;
 /// Least and most of the rate at the start.
 const RATES: (f64, f64) = (0.005, 0.05);
@@ -83,11 +82,8 @@ impl Exposures {
     }
 
     /// Sets the initial exposures: a gain above 0 and an offset for each photo, or None for a photo whose
-    /// exposure stays neutral. Their backgrounds are ignored.
-    ///
-    /// A poor render makes gains seem lower than they are, so known values are more reliable at first.
-    /// Each initial value has a pull: this times half the squared distance of log gains and offsets is
-    /// added to the loss.
+    /// exposure stays neutral. `pulls` times half the squared distances of log gains and offsets from
+    /// them is added to the loss, because a poor render makes gains seem lower than they are.
     pub fn start(&mut self, start: &[Option<Exposure<f64>>], pulls: &[f64]) -> Result<()> {
         let count = self.is_fitted.len();
         if start.len() != count || pulls.len() != count {
@@ -124,11 +120,6 @@ impl Exposures {
     }
 
     /// Resumes from the result of [`Exposures::state`].
-    ///
-    /// # Errors
-    ///
-    /// [`Error::Argument`] if it belongs to other photos, or a value is not finite or a gain not
-    /// positive.
     pub fn resume(&mut self, state: ExposureState) -> Result<()> {
         let n = self.is_fitted.len();
         let ExposureState { gains, offsets, first, second, gradients, .. } = &state;
@@ -187,8 +178,7 @@ impl Exposures {
         }
     }
 
-    /// Moves the exposures by the gradients of the round; `progress` of the fit is in 0..1, `rounds` is
-    /// the approximate number of rounds of the fit.
+    /// Moves the exposures by the round's gradients; `progress` is in 0..1, `rounds` per fit.
     pub fn step(&mut self, progress: f64, rounds: f64) {
         let decayed = DECAY.powf(progress.clamp(0.0, 1.0));
         let rate = (REACH / rounds.max(1.0)).clamp(RATES.0, RATES.1);
@@ -199,8 +189,7 @@ impl Exposures {
                 continue;
             }
             let (gain, offset, mean) = (self.state.gains[k], self.state.offsets[k], self.means[k]);
-            // More contrast c about the mean: the gain grows and the offset falls so that the mean color
-            // stays.
+            // Contrast c about the mean: gain grows and offset falls so that the mean color stays.
             let v: [f64; 6] = std::array::from_fn(|i| match i {
                 0..3 => gain[i] * v[i] - (mean[i] - offset[i]) * v[i + 3],
                 _ => v[i],
@@ -230,8 +219,7 @@ impl Exposures {
         })
     }
 
-    /// Brings the means of log gain and of offset over the fitted photos back to zero, as if the
-    /// splats' colors took them up.
+    /// Shifts the fitted photos' mean log gain and offset to zero; the splats' colors adapt.
     fn anchor(&mut self) {
         let fitted: Vec<usize> = (0..self.is_fitted.len()).filter(|&k| self.is_fitted[k]).collect();
         if fitted.is_empty() {

@@ -57,8 +57,7 @@ pub struct Fitter {
     extent: f32,
     /// How often each photo comes in a round of steps, and the first step that is not of it.
     schedule: Vec<(u32, Option<u32>)>,
-    /// Active photos with repetitions, their order in this round, and the first step of rounds with these
-    /// photos.
+    /// Active photos with repetitions, this round's order, and the first step of such rounds.
     round: Vec<usize>,
     order: Vec<usize>,
     rounds_from: u32,
@@ -75,8 +74,7 @@ pub fn scene_extent(cameras: &[Camera]) -> f64 {
 }
 
 impl Fitter {
-    /// A fit of `state` to `targets`, whose cameras are relative to the scene's origin; `step` steps
-    /// have been done already.
+    /// A fit after `step` steps; cameras are relative to the scene's origin.
     pub fn new(
         mut device: Box<dyn FitDevice>,
         targets: Vec<Target>,
@@ -243,11 +241,7 @@ impl Fitter {
         Ok(self.moving.as_ref().map(Cameras::state))
     }
 
-    /// Makes cameras of one number move as one; before pose priors are set.
-    ///
-    /// # Errors
-    /// [`Error::Argument`] if cameras are not fitted, there is not a number for each, or cameras of
-    /// one number do not share a center.
+    /// Makes cameras of one number move as one; call it before [`Fitter::set_pose_priors`].
     pub fn set_rigs(&mut self, numbers: &[u32]) -> Result<()> {
         let Some(cameras) = self.moving.as_mut() else {
             return Err(Error::argument("rigs", "are of cameras that are not fitted"));
@@ -255,10 +249,7 @@ impl Fitter {
         cameras.set_rigs(numbers)
     }
 
-    /// Sets the pose priors of the cameras that are fitted, one for each; before anything else.
-    ///
-    /// # Errors
-    /// [`Error::Argument`] if cameras are not fitted, or the priors are not one per camera.
+    /// Sets the pose priors, one for each fitted camera, before the first step.
     pub fn set_pose_priors(&mut self, priors: Vec<PosePrior>) -> Result<()> {
         let Some(cameras) = self.moving.as_mut() else {
             return Err(Error::argument("holds", "are of cameras that are not fitted"));

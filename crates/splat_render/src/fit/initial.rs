@@ -11,9 +11,8 @@ const OPACITY: f32 = 0.1;
 /// Neighbors whose mean distance sets a point's size (3DGS).
 const NEIGHBORS: usize = 3;
 
-/// One round splat per point, as large as the mean distance to its three nearest neighbors.
-///
-/// `points` `[P]` world frame less the scene's origin; `colors` `[P]` in 0..1.
+/// Makes a round splat per point, as large as the mean distance to its three nearest neighbors. `points`
+/// are relative to the scene's origin, `colors` in 0..1.
 pub fn splats_from_points(
     points: &[[f32; 3]],
     colors: &[[f32; 3]],

@@ -74,8 +74,7 @@ pub fn plane_sweep(photos: &[GrayPhoto], sweeps: &[Sweep]) -> Result<Vec<DepthMa
     Ok(sweeps.par_iter().map(|sweep| dispatch(Sweeping { photos, sweep })).collect())
 }
 
-/// Compiled for the widest instruction set there is: its loops are plain, for the compiler to turn into
-/// vectors.
+/// Compiled for the machine's widest instruction set; plain loops, which compilers vectorize.
 struct Sweeping<'a> {
     photos: &'a [GrayPhoto],
     sweep: &'a Sweep,
@@ -288,8 +287,7 @@ impl Patches {
 struct Boxes {
     width: usize,
     height: usize,
-    /// Sums along the row of a value, its square and its product with another, for each row of the
-    /// square in turn.
+    /// Row sums of a value, its square and its product with another, for each row of the square.
     rows: [Vec<f32>; 3],
     /// The values with zeros before and after.
     padded: [Vec<f32>; 3],
@@ -316,9 +314,8 @@ impl Boxes {
         }
     }
 
-    /// Adds a row of `values` and of their products with `others`. Returns the means of the row that
-    /// this completes, `RADIUS` further up, and its pixels. Rows come in order, from 0 to the height
-    /// and `RADIUS` more.
+    /// Adds a row of `values` and of their products with `others`, in order. Returns the pixels and means
+    /// of the row that this completes, `RADIUS` further up.
     #[inline(always)]
     fn next_row(
         &mut self,

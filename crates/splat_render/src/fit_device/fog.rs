@@ -1,11 +1,8 @@
 //! Fog: splats right in front of a camera, far nearer than the surfaces in its picture.
 //!
-//! A large, faint splat there tints one photo and little else. It explains differences between photos
-//! (exposure, vignetting) and hides the scene behind it, which then gets no gradients. On plain walls and
-//! tables it can outgrow the scene.
-//!
-//! The host estimates each camera's nearest surface from a sample of the splats. Every splat is compared
-//! with it in f32, without operations that round differently on a GPU.
+//! Fog explains differences between photos (exposure, vignetting) and hides the scene, which then gets no
+//! gradients. The host estimates each camera's nearest surface from a sample of the splats. Every splat
+//! is compared with it in f32, without operations that round differently on a GPU.
 
 use bytemuck::{Pod, Zeroable};
 

@@ -32,8 +32,7 @@ pub(crate) fn dropout_threshold(rate: f32) -> u32 {
     (f64::from(rate) * 4_294_967_296.0) as u32
 }
 
-/// Whether a step with this seed and dropout leaves out the splat `index` (DropGaussian, Park et
-/// al. 2025). The same on every backend.
+/// Whether a step drops the splat `index` (DropGaussian, Park et al. 2025); same on every backend.
 pub fn is_dropped(seed: u32, index: u32, rate: f32) -> bool {
     hash(index ^ hash(seed ^ 0x5bd1_e995)) < dropout_threshold(rate)
 }

@@ -152,8 +152,7 @@ impl SplatBins {
         Groups::Indirect(self.dispatches.clone(), 0)
     }
 
-    /// Indirect groups of 64 splats each over all splats once pairs are counted; no groups if the pairs
-    /// do not fit.
+    /// Indirect groups of 64 of all splats once pairs are counted; none if the pairs do not fit.
     pub fn of_all(&self) -> Groups {
         Groups::Indirect(self.dispatches.clone(), 12)
     }
@@ -268,8 +267,7 @@ impl SplatBins {
         ops
     }
 
-    /// Cuts a picture's tiles into chunks whose pairs fit; reads the counts back. The depth order
-    /// must be there.
+    /// Cuts tiles into chunks whose pairs fit; reads the counts back. Needs the depth order.
     pub fn plan(
         &self,
         gpu: &Gpu,
@@ -329,8 +327,7 @@ impl PairBins {
         })
     }
 
-    /// The splat of each pair in tile order after the sort of a chunk of `tiles` tiles, in a buffer of
-    /// keys that is free after the sort's last pass.
+    /// The splat of each pair in tile order, in a buffer of keys that is free after the sort.
     pub fn splat_from_pair(&self, tiles: u32) -> &wgpu::Buffer {
         &self.keys[((sort_passes(tiles, self.digit_bits) + 1) % 2) as usize]
     }

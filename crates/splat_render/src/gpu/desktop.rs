@@ -1,9 +1,8 @@
 //! Disables a Vulkan layer that prints an error on machines without a desktop.
 //!
-//! Mesa's layer `VK_LAYER_MESA_device_select` asks the Wayland compositor which GPU it uses. Without a
-//! compositor, libwayland prints "error: XDG_RUNTIME_DIR is invalid or not set in the environment." on
-//! stderr for each adapter query. Vulkan has no call that disables such a layer; its manifest names the
-//! environment variable `NODEVICE_SELECT` for it.
+//! Mesa's layer `VK_LAYER_MESA_device_select` asks the Wayland compositor which GPU it uses; without one,
+//! libwayland prints an error for each adapter query. The layer's manifest names the environment variable
+//! `NODEVICE_SELECT` to disable it.
 
 use std::env;
 use std::path::Path;

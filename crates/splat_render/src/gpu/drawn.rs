@@ -1,5 +1,4 @@
-//! Shared parts of the device's density controls: sums over all splats, and new splats that are not yet
-//! in Morton order.
+//! Shared by the device's density controls: sums over all splats, and sorting the new splats.
 
 use bytemuck::{Pod, Zeroable};
 

@@ -60,8 +60,7 @@ impl ExposureBuffers {
         self.op(gpu, Kernel::Exposure, of)
     }
 
-    /// Converts gradients of the corrected colors to the picture's, and sums the gradients of gain and
-    /// offset.
+    /// Computes the picture's gradients, and sums those for gain and offset.
     pub fn backward(&self, gpu: &Gpu, of: Exposed<'_>) -> Op {
         self.op(gpu, Kernel::ExposureBackward, of)
     }

@@ -1,5 +1,4 @@
-//! Structs shared with WGSL (`shaders/shared.wgsl`) and the row lengths of the flat buffers. A test holds
-//! offsets and sizes against naga's reflection of the shaders.
+//! Structs shared with WGSL, and the row lengths of flat buffers. A test checks them with naga.
 
 use std::ops::Range;
 
@@ -24,10 +23,9 @@ pub(super) const GRADIENT_ABSOLUTE: usize = GRADIENT + 2;
 /// Floats of a camera's gradient: rows of the 3x4 viewmat, fx, fy, cx, cy.
 pub(super) const CAMERA: usize = 16;
 
-/// Words per splat of a fit's notes, with their offsets: the sum of gradient lengths and the number of
-/// steps seen, as floats, for density control; twice the first step that the colors wait for, plus 1 if
-/// that step has a gradient; then that gradient of the color (3 floats) and its viewing direction (3
-/// floats).
+/// Words per splat of a fit's notes, with their offsets: gradient sum and steps seen (floats), for
+/// density control; twice the first step that colors wait for, plus 1 if it has a gradient; that gradient
+/// of the color and its viewing direction (3 floats each).
 pub(super) const NOTES: usize = 9;
 pub(super) const NOTE_PULL: usize = 0;
 pub(super) const NOTE_SEEN: usize = 1;
@@ -35,8 +33,7 @@ pub(super) const NOTE_WAITS: usize = 2;
 pub(super) const NOTE_COLOR: usize = 3;
 pub(super) const NOTE_DIRECTION: usize = 6;
 
-/// Splats per workgroup of the per-splat kernels; windows are multiples of it, which also keeps
-/// every per-splat buffer's offset a multiple of 256 bytes.
+/// Splats per workgroup and unit of windows, which keeps buffer offsets multiples of 256 bytes.
 pub(super) const SPLATS_PER_GROUP: u32 = 64;
 
 /// Workgroups of the exposure kernels; each has separate sums.

@@ -1,6 +1,5 @@
-//! MCMC's density control on the device, with the bits of `fit_device::mcmc`: dead splats move to living
-//! ones, splats are added, and all are sorted along Morton's curve. The host reads the centers of a
-//! sample, the sum of the weights, and the bounding box.
+//! MCMC's density control on the device, with the bits of `fit_device::mcmc`. The host reads the centers
+//! of a sample, the sum of the weights, and the bounding box.
 
 use bytemuck::{Pod, Zeroable};
 use rayon::prelude::*;

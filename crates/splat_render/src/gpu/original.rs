@@ -1,6 +1,5 @@
-//! The original density control on the device, with the bits of `fit_device::original`: splats are cloned,
-//! split and pruned, and all are put in the order of Morton's curve. The host learns how many stay and
-//! grow, and the bounding box.
+//! The original density control on the device, with the bits of `fit_device::original`. The host reads
+//! the numbers of splats that stay and grow, and the bounding box.
 
 use bytemuck::{Pod, Zeroable};
 

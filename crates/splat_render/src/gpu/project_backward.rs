@@ -16,8 +16,7 @@ pub(super) fn camera_sums(splats: u32) -> u32 {
     splats.div_ceil(SPLATS_PER_GROUP)
 }
 
-/// Gradients of viewmat and intrinsics from the sums of all workgroups, which are few enough to be
-/// added in f64, in their order.
+/// Gradients of viewmat and intrinsics from the workgroups' sums, added in f64 in order.
 pub(super) fn camera_sum(sums: &[u8]) -> ([[f64; 4]; 3], [f64; 4]) {
     let mut total = [0.0f64; CAMERA];
     for row in sums.chunks_exact(CAMERA * 4) {

@@ -43,8 +43,7 @@ pub(super) struct Binned {
 }
 
 impl Binned {
-    /// Uploads the splats, sorts them by depth and cuts the tiles into chunks that fit a binding, at
-    /// `floats` floats per pair.
+    /// Uploads and sorts the splats and cuts the tiles into chunks, at `slot_floats` floats per pair.
     pub fn new(
         gpu: &Gpu,
         projected: &Projected<f32>,

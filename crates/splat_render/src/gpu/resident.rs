@@ -79,8 +79,7 @@ impl ResidentSplats {
         self.len() == 0
     }
 
-    /// Records the project stage and the sort by depth, each a pass with its timestamps. One view per
-    /// submission: the last one given counts for all of it.
+    /// Records project and sort, a pass with timestamps each. Only one view per submission.
     pub fn record(
         &self,
         gpu: &Gpu,

@@ -1,6 +1,5 @@
-//! Pictures that stay on the device: resident splats, binned and rasterized for one camera after
-//! another. Of each, only the number of (splat, tile) pairs is read back: it decides how much room
-//! they need.
+//! Pictures on the device: resident splats, binned and rasterized for one camera after another. The host
+//! reads back only the number of (splat, tile) pairs.
 
 use std::ops::Range;
 
@@ -44,9 +43,8 @@ impl ResidentPicture {
     }
 
     /// Draws the columns of a camera's picture: submits project, sort and a count of the pairs, waits for
-    /// the count, and records the remaining commands to `encoder`. The stages project, sort, bin and
-    /// rasterize each get the timestamps of their last pass; if the pairs of all tiles exceed one
-    /// binding, rasterize includes the bin stages of later parts.
+    /// the count, and records the rest to `encoder`. Each stage gets the timestamps of its last pass; if
+    /// the pairs exceed one binding, rasterize includes later parts' bin stages.
     pub fn record(
         &mut self,
         gpu: &Gpu,

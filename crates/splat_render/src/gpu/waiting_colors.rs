@@ -1,5 +1,4 @@
-//! Colors that wait (`fit_device::waiting`): in fits, project updates the colors of visible splats before
-//! it evaluates them, and another kernel updates all.
+//! Colors that wait (`fit_device::waiting`): in fits, project updates visible ones before use.
 
 use std::ops::Range;
 
@@ -11,7 +10,7 @@ use super::layout::{GEOMETRY, NOTES, SPLATS_PER_GROUP};
 use super::project::{Projection, SPLAT_2D, rows, window_uniform};
 
 impl AdamBuffers {
-    /// Projects all splats and updates the colors of visible ones; `steps` is a
+    /// Projects all splats and updates visible colors; `steps` is a
     /// [`ColorSteps`](super::layout::ColorSteps).
     pub fn project_ops(
         &self,

@@ -20,8 +20,7 @@ use crate::stages::{
 };
 use crate::target::{Target, TargetDepth};
 
-/// Maximum difference from the reference, relative to the largest value: a hundred times f32's rounding,
-/// and far below the error of a miscompiled kernel.
+/// Maximum relative difference from the reference: a hundred times f32's rounding.
 const TOLERANCE: f64 = 1e-3;
 /// Of the scene: one whose decisions are clear (a test has how).
 const SEED: u32 = 97;
@@ -32,8 +31,7 @@ const BACKGROUND: [f64; 3] = [0.25, 0.5, 0.75];
 /// Outputs of a stage as plain numbers.
 type Outputs = Vec<(&'static str, Vec<f64>)>;
 
-/// Compiles every kernel and compares the stages on a small scene with the reference, and a step and runs
-/// of density control of a fit with the CPU's.
+/// Compiles every kernel and compares all stages and a fit on a small scene with reference and CPU.
 pub fn self_test(gpu: &Arc<Gpu>) -> Result<()> {
     gpu.compile_all()?;
     let mut outputs = all_stages::<f32>(&**gpu)?;
@@ -114,8 +112,7 @@ fn photo() -> Target {
     Target::new(SIZE.0, SIZE.1, 3, (0..values).map(|k| (255.0 * draw(k)) as u8).collect())
 }
 
-/// Depths a third before and behind the scene's, at pixels whose alpha is clearly above or below the
-/// threshold of the depth loss.
+/// Depths a third off the scene's, at pixels whose alpha is clearly above or below the threshold.
 fn depths() -> Result<TargetDepth> {
     let options = ProjectOptions { antialiased: true, ..ProjectOptions::default() };
     let projected = Reference.project(&scene::<f64>().params(2), &camera(), &options)?;

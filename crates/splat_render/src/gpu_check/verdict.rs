@@ -1,5 +1,4 @@
-//! Remembers across processes that a device passed its self-test: the test takes a second or more with
-//! uncached kernels. Failures are not remembered.
+//! Remembers across processes that a device passed its self-test, which takes about a second.
 
 use std::env;
 use std::hash::{DefaultHasher, Hash, Hasher};
@@ -15,8 +14,7 @@ use crate::io::write_atomically;
 /// Folder of the verdicts; an empty value keeps none.
 const VARIABLE: &str = "IGSR_GPU_CACHE";
 
-/// [`Gpu::new`], with a device that passes [`self_test`] now or passed it before with the same driver and
-/// kernels.
+/// [`Gpu::new`], with a device that passed [`self_test`] now or earlier with the same driver and kernels.
 pub fn open_tested(software_allowed: bool) -> Result<Arc<Gpu>> {
     open_tested_with(software_allowed, &Injected::default())
 }

@@ -27,10 +27,6 @@ pub struct ExrPicture<'a> {
 }
 
 /// Writes a picture as an EXR file of one layer with the channels A, B, G, R, Z, whole or not at all.
-///
-/// # Errors
-///
-/// As [`encode_exr`], and [`Error::File`] if the file cannot be written: the existing file is unchanged.
 pub fn write_exr(path: &Path, picture: &ExrPicture<'_>) -> Result<()> {
     let bytes = encode_exr(picture)?;
     write_atomically(path, |out| out.write_all(&bytes))

@@ -10,14 +10,8 @@ use crate::error::{Error, Result};
 /// Maximum number of pixels of a depth map.
 const MOST_PIXELS: usize = 1 << 28;
 
-/// Reads channel Z of an EXR file's largest layer, or its only channel.
-///
-/// Returns height, width and `[H * W]` numbers, row-major.
-///
-/// # Errors
-///
-/// [`Error::File`] if the file cannot be read; [`Error::Argument`] if it is not an EXR file, is damaged,
-/// or has several channels but no Z.
+/// Reads channel Z of an EXR file's largest layer, or its only channel. Returns height, width and `[H *
+/// W]` numbers, row-major.
 pub fn read_exr_depth(path: &Path) -> Result<(usize, usize, Vec<f32>)> {
     let bytes = std::fs::read(path).map_err(|e| Error::file(path, e.to_string()))?;
     decode(bytes)

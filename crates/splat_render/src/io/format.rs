@@ -61,8 +61,7 @@ impl Format {
         ENDINGS.iter().find(|(ending, _)| name.ends_with(ending)).map(|(_, format)| *format)
     }
 
-    /// The format of a file that starts with `head`. A compressed .ply counts as .ply here, since only
-    /// the header shows the difference.
+    /// The format of a file that starts with `head`; a compressed .ply counts as .ply.
     pub(super) fn of(head: &[u8], named: &Named<'_>) -> Result<Self> {
         let marks: [(&[u8], Self); 7] = [
             (b"ply\n", Self::Ply),

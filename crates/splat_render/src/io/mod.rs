@@ -50,11 +50,6 @@ const STREAMED: &str = "lod-meta.json";
 
 /// Reads a file of any format in [`Format`]. The format is detected from the content or, for formats
 /// without a signature, from the ending. A file named `meta.json` belongs to a SOG in a folder.
-///
-/// # Errors
-///
-/// [`crate::Error::File`] that names the file: it cannot be opened or read, is damaged, truncated or of
-/// an unknown format.
 pub fn read_splats(path: &Path) -> Result<Loaded> {
     let named = Named(path);
     if path.file_name().is_some_and(|name| name == sog::META) {
@@ -111,12 +106,8 @@ fn parse(mut bytes: &[u8], format: Format, named: &Named<'_>) -> Result<Loaded> 
     }
 }
 
-/// Writes splats, whole or not at all, in the format of the ending. Returns one message for each
-/// thing that the format cannot hold and that was left out or rounded.
-///
-/// # Errors
-/// [`crate::Error::File`] if the ending names no writable format or the file cannot be written;
-/// [`crate::Error::Argument`] if the splats' arrays differ in length or the format cannot hold them.
+/// Writes splats, whole or not at all, in the format of the ending. Returns one message for each thing
+/// that the format cannot hold and that was left out or rounded.
 pub fn write_splats(path: &Path, file: &SplatFile) -> Result<Vec<String>> {
     let format = Format::to_write(path)?;
     file.splats.validate()?;

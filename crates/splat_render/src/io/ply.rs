@@ -102,8 +102,7 @@ impl Rows {
     }
 }
 
-/// Reads the data after the header of a `.ply` of `size` bytes, row by row; sizes are checked before
-/// anything is allocated.
+/// Reads the data of a `.ply` of `size` bytes row by row; checks sizes before allocating.
 pub fn read(
     reader: &mut impl BufRead,
     header: &Header,

@@ -11,8 +11,7 @@ use super::{open_file, read_splats};
 use crate::error::Result;
 use crate::splats::SplatArrays;
 
-/// A file of splats, from the first to the last. A `.ply` of floats stays on the disk; files of other
-/// formats are smaller, and read whole.
+/// A stream of a file's splats. A `.ply` of floats is read in parts, smaller formats whole.
 pub struct SplatRows {
     path: PathBuf,
     source: Source,

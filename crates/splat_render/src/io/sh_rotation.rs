@@ -48,8 +48,7 @@ impl ShRotation {
 
 type Basis = [f64; SH_COEFFS_MAX];
 
-/// Solves sum_a x[a][b] Y_a(d) = Y_b(back(d)) over all directions, in the sense of least squares:
-/// the bands are closed under rotation, so nothing is left over.
+/// Solves sum_a x[a][b] Y_a(d) = Y_b(back(d)) by least squares; exact, since bands are closed.
 fn band_matrix(degree: u32, bases: &[(Basis, Basis)]) -> Vec<f64> {
     let start = sh::coeffs(degree - 1);
     let each = sh::coeffs(degree) - start;

@@ -251,10 +251,7 @@ fn pack_rotation(wxyz: [f32; 4]) -> u32 {
     })
 }
 
-/// Bits after the point that leave room for the largest coordinate.
-///
-/// Units are arbitrary, so positions use all 24 bits; a fixed number of fractional bits would suit scenes
-/// of one size.
+/// Bits after the point that leave room for the largest coordinate, as units are arbitrary.
 fn fraction_bits(splats: &SplatArrays) -> Result<u8> {
     let largest = splats.means.as_flattened().iter().fold(0.0f32, |far, c| far.max(c.abs()));
     let limit = f64::from((1u32 << 23) - 1);

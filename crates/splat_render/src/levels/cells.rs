@@ -57,8 +57,7 @@ impl Cells {
     }
 }
 
-/// The axis along which points spread most, a plane at their middle, and how many lie below it; those are
-/// put in front. None if no plane has points on both sides.
+/// Splits points at the middle of their longest axis; None if no plane has points on both sides.
 fn split(points: &mut [[f32; 3]]) -> Option<(usize, f32, usize)> {
     let last = points.len() - 1;
     let mut at = |axis: usize, part: f64| {

@@ -55,10 +55,8 @@ impl Ord for Candidate {
     }
 }
 
-/// Chooses levels for a view so that no more splats than the budget are held.
-///
-/// The budget counts the chosen level of each cell and its coarsest, which is kept so that something is
-/// there while the view moves.
+/// Chooses levels for a view within the budget, which counts the chosen level of each cell and its
+/// coarsest, kept for moving views.
 pub fn choose(manifest: &Manifest, view: &View, budget: usize) -> Choice {
     let cells = &manifest.cells;
     let origin = DVec3::from(manifest.origin);

@@ -64,10 +64,6 @@ pub struct Manifest {
 
 impl Manifest {
     /// Reads the file, or the one in a folder.
-    ///
-    /// # Errors
-    ///
-    /// [`Error::File`] that names the file: it cannot be read, or is not a valid index.
     pub fn read(path: &Path) -> Result<Self> {
         let file = if path.is_dir() { path.join(INDEX) } else { path.to_owned() };
         let bad = |what: String| Error::file(&file, format!("{what}; write the levels again"));
@@ -195,8 +191,7 @@ fn leaf(
     Ok(Cell { low, high, runs, errors })
 }
 
-/// About how far splats lie apart at each level, if all lie on the largest face of the cell's box; 0 at the
-/// finest.
+/// Approximate distance between splats at each level, by the cell's largest face; 0 at the finest.
 fn spacings(low: &[f64; 3], high: &[f64; 3], runs: &[Option<Run>]) -> Vec<f64> {
     let finest = runs.iter().position(Option::is_some);
     let face = face(low, high);

@@ -34,10 +34,7 @@ pub struct Resident {
 }
 
 impl Resident {
-    /// Nothing but the environment, which is drawn always.
-    ///
-    /// # Errors
-    /// [`Error::File`]: it cannot be read; [`Error::Argument`]: the budget is less than it takes.
+    /// Starts with the environment, which is always drawn. Fails if the budget is too small for it.
     pub fn new(manifest: &Manifest, budget: usize) -> Result<Self> {
         let mut out = Self { budget, ..Self::default() };
         if let Some(name) = &manifest.environment {
@@ -76,8 +73,7 @@ impl Resident {
         out
     }
 
-    /// Keeps the splats of a file that a choice needs. Splats it does not need are dropped as room is
-    /// required.
+    /// Keeps the splats of a file that a choice needs; others are dropped as room is required.
     pub fn load(&mut self, manifest: &Manifest, choice: &Choice, file: usize) -> Result<()> {
         let read = read_file(manifest, file)?;
         self.keep(manifest, choice, file, &read);
@@ -139,11 +135,7 @@ fn wanted(manifest: &Manifest, choice: &Choice) -> Vec<(usize, usize)> {
     order.iter().filter_map(coarsest).chain(order.iter().filter_map(chosen)).collect()
 }
 
-/// Reads a file and checks its number of splats.
-///
-/// # Errors
-///
-/// [`Error::File`] that names it: it cannot be read, or has another number of splats than the manifest.
+/// Reads a file and checks its number of splats against the manifest.
 fn read_file(manifest: &Manifest, file: usize) -> Result<SplatFile> {
     let path = manifest.folder.join(&manifest.files[file]);
     let mut read = read_splats(&path)?.file;
@@ -195,12 +187,8 @@ fn joined(parts: &[&SplatArrays]) -> SplatArrays {
     out
 }
 
-/// Reads the finest level whose cells together fit a budget of splats; else the coarsest. For viewers
-/// that do not choose levels by distance.
-///
-/// # Errors
-///
-/// [`Error::File`]: a file cannot be read, or even the coarsest level exceeds the budget.
+/// Reads the finest level whose cells together fit a budget of splats; fails if even the coarsest does
+/// not. For viewers that do not choose levels by distance.
 pub fn read_within(path: &Path, budget: usize) -> Result<(SplatFile, usize)> {
     let manifest = Manifest::read(path)?;
     let mut resident = Resident::new(&manifest, budget.max(1))?;

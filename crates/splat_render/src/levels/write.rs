@@ -41,13 +41,9 @@ pub struct LevelsWritten {
     pub notes: Vec<String>,
 }
 
-/// Writes the scene of a file into a folder, which is there and empty: `levels` of them, each with a
-/// quarter of the splats of the next finer one, in cells of at most about `per_cell` splats. None, with the
-/// folder half written, once `goes_on`, which is asked now and then, says no.
-///
-/// # Errors
-/// [`Error::Argument`]: a number cannot be used; [`Error::File`]: a file cannot be read or written, or has
-/// no splats.
+/// Writes the scene of a file into an existing, empty folder: `levels` levels, each with a quarter of the
+/// splats of the next finer one, in cells of about `per_cell` splats. None, with the folder half written,
+/// once `goes_on` returns false.
 pub fn write_levels(
     source: &Path,
     folder: &Path,

@@ -16,8 +16,7 @@ fn photo(target: &Target, background: [f64; 3]) -> Vec<[f64; 3]> {
         .collect()
 }
 
-/// Pixels that the window around a pixel meets, each with its weight; there is nothing beyond the
-/// picture.
+/// The pixels of the window around a pixel, within the picture, with their weights.
 fn window(width: usize, height: usize, pixel: usize) -> impl Iterator<Item = (usize, f64)> {
     let (half, side) = (SSIM_WINDOW.len() / 2, SSIM_WINDOW.len());
     let (row, column) = (pixel / width, pixel % width);

@@ -1,5 +1,4 @@
-//! The oracle: f64, short, plain, no tiles, no tricks. Every other implementation is tested
-//! against it, stage by stage.
+//! The reference: f64, short, plain, untiled. All implementations are tested against it.
 
 mod adam;
 mod depth_loss;

@@ -92,8 +92,7 @@ pub(super) fn geometry(
 
 /// Unit view direction in the world and the length it was normalized by.
 pub(super) fn direction(camera: &Camera, t: DVec3) -> (DVec3, f64) {
-    // R^T t is the vector from the camera's center to the mean, without the cancellation of
-    // subtracting two far-away points.
+    // R^T t is the vector from center to mean, without cancellation far from the origin.
     let along = camera.rotation().transpose() * t;
     (along / along.length(), along.length())
 }
@@ -133,8 +132,7 @@ pub(super) fn project(
             Colors::Sh { degree, stride, coeffs } => {
                 let dir = direction(camera, g.t).0;
                 let color = sh_color(degree, &coeffs[i * stride..], dir);
-                // Before the cut at zero, which would hide a poisoned coefficient here and let it
-                // out in the gradients.
+                // Before the clamp at zero, which would hide an invalid coefficient.
                 if !color.is_finite() {
                     continue;
                 }

@@ -67,8 +67,7 @@ pub trait Stages<T: Float> {
         self.project_backward_unchecked(splats, camera, options, projected, v_projected)
     }
 
-    /// Applies a photo's gain and offset to a picture's colors, `[H * W]`; see [`Exposure`]. Reads the
-    /// image's color and transmittance.
+    /// Applies a photo's gain and offset to a picture's colors, `[H * W]`; see [`Exposure`].
     fn exposure(&self, image: &Image<T>, exposure: &Exposure<T>) -> Result<Vec<[T; 3]>> {
         check_exposure(image, exposure)?;
         self.exposure_unchecked(image, exposure)

@@ -53,14 +53,13 @@ impl Default for ProjectOptions {
 }
 
 impl ProjectOptions {
-    /// Checks every setting: `near` finite and not negative, `far` beyond it, `blur` finite and not
-    /// negative.
+    /// Checks every setting.
     pub fn validate(&self) -> Result<()> {
-        if !(self.near.is_finite() && self.near >= 0.0) {
-            return Err(Error::argument(
-                "near",
-                format!("must be finite and not negative, got {}", self.near),
-            ));
+        for (name, value) in [("near", self.near), ("blur", self.blur)] {
+            if !(value.is_finite() && value >= 0.0) {
+                let reason = format!("must be finite and not negative, got {value}");
+                return Err(Error::argument(name, reason));
+            }
         }
         if self.far.is_nan() || self.far <= self.near {
             return Err(Error::argument(
@@ -68,17 +67,10 @@ impl ProjectOptions {
                 format!("must exceed near, {}, got {}", self.near, self.far),
             ));
         }
-        if !(self.blur.is_finite() && self.blur >= 0.0) {
-            return Err(Error::argument(
-                "blur",
-                format!("must be finite and not negative, got {}", self.blur),
-            ));
-        }
         Ok(())
     }
 
-    /// Minimum depth of drawn splats. Above 0 even if `near` is 0: splats at or behind the camera's plane
-    /// have no projection.
+    /// Minimum depth of drawn splats; above 0, since splats in the camera's plane have no projection.
     pub fn nearest(&self) -> f32 {
         self.near.max(f32::MIN_POSITIVE)
     }
@@ -340,8 +332,7 @@ pub struct AdamStep {
 }
 
 impl AdamStep {
-    /// Whether nothing moves: all rates are 0. The moments then stay as they are, too, and there is
-    /// no noise.
+    /// Whether all rates are 0: then no parameter, no moment, and no noise changes.
     pub fn is_frozen(&self) -> bool {
         self.rates == Rates::ZERO
     }

@@ -1,4 +1,4 @@
-//! What the tests share: made-up scenes, folders that vanish, and the program.
+//! Shared by the tests: random scenes, temporary folders, and the program.
 
 #![allow(dead_code, reason = "each test file uses its own part")]
 
@@ -14,7 +14,7 @@ use splat_render::Camera;
 use splat_render::fit::SplatArrays;
 use splat_render::io::{SplatFile, write_splats};
 
-/// A new folder that goes away with this.
+/// A new folder, deleted on drop.
 pub struct Folder(pub PathBuf);
 
 impl Folder {
@@ -38,7 +38,7 @@ impl Drop for Folder {
     }
 }
 
-/// Numbers in 0..1 that are the same in every run.
+/// Pseudorandom numbers in 0..1.
 pub struct Numbers(u64);
 
 impl Numbers {
@@ -81,7 +81,7 @@ pub fn write(path: &Path, file: &SplatFile) {
     write_splats(path, file).expect("a splat file");
 }
 
-/// A file of cameras as igsr writes it, with photos that are not there.
+/// A file of cameras in igsr's format, with missing photos.
 pub fn cameras_json(cameras: &[Camera]) -> String {
     let frame = |(i, camera): (usize, &Camera)| {
         let to_world = camera.viewmat.inverse() * DMat4::from_scale(DVec3::new(1.0, -1.0, -1.0));
@@ -96,7 +96,7 @@ pub fn cameras_json(cameras: &[Camera]) -> String {
     format!("{{\"camera_model\": \"PINHOLE\", \"frames\": [{}]}}", frames.join(", "))
 }
 
-/// Writes that file.
+/// Writes [`cameras_json`].
 pub fn write_cameras(path: &Path, cameras: &[Camera]) {
     std::fs::write(path, cameras_json(cameras)).expect("cameras");
 }
@@ -111,29 +111,40 @@ pub fn program() -> Command {
     command
 }
 
-/// Runs the program, and asserts that it ends well.
-pub fn run(arguments: &[&dyn AsRef<std::ffi::OsStr>]) -> Output {
-    let output = program().args(arguments).output().expect("splat-view starts");
-    assert!(
-        output.status.success(),
-        "{arguments:?}: {}",
-        said(&output),
-        arguments = words(arguments)
-    );
+/// The program with a scene and options, which are separated by spaces.
+pub fn command(scene: &Path, options: &str) -> Command {
+    let mut command = program();
+    command.arg(scene).args(options.split_whitespace());
+    command
+}
+
+/// Runs a command, and asserts that it succeeds.
+pub fn run(command: &mut Command) -> Output {
+    let output = command.output().expect("splat-view starts");
+    assert!(output.status.success(), "{command:?}: {}", said(&output));
     output
 }
 
-fn words(arguments: &[&dyn AsRef<std::ffi::OsStr>]) -> Vec<String> {
-    arguments.iter().map(|a| a.as_ref().to_string_lossy().into_owned()).collect()
+/// Draws a scene on the CPU; returns the picture, and the program's messages.
+pub fn draw(scene: &Path, options: &str) -> (Picture, String) {
+    let out = scene.with_extension("drawn.png");
+    let mut command = command(scene, options);
+    let output = run(command.args(["--backend", "cpu", "--screenshot"]).arg(&out));
+    (read_png(&out), said(&output))
 }
 
-/// What the program said.
+/// The program's messages.
 pub fn said(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).trim_end().to_owned()
 }
 
-/// Asserts that the program ended with one error message that contains the words.
-pub fn refused(output: &Output, words: &[&str]) {
+/// Asserts that a command ends with one error message that contains the words.
+pub fn refused(command: &mut Command, words: &[&str]) {
+    refused_with(&command.output().expect("splat-view starts"), words);
+}
+
+/// [`refused`] of a command that has ended.
+pub fn refused_with(output: &Output, words: &[&str]) {
     let text = said(output);
     assert_eq!(output.status.code(), Some(1), "{text}");
     assert_eq!(text.lines().count(), 1, "not one message: {text}");

@@ -31,8 +31,7 @@ use motion::{POSE, PoseMatrix, move_by, tangent};
 use preconditioning::{all_scales, focal_pixels};
 use rigs::Rigs;
 
-/// Adam's decay of the first and second moments and its epsilon. A camera has one step a round: the
-/// second moment must forget within tens of them.
+/// Adam's betas and epsilon. A camera has one step per round, so moments must decay within tens of steps.
 const ADAM: (f64, f64, f64) = (0.9, 0.99, 1e-15);
 
 /// Everything needed to go on bit for bit; one entry per camera.
@@ -42,8 +41,7 @@ pub struct CameraState {
     pub viewmats: Vec<DMat4>,
     /// (fx, fy, cx, cy), pixels.
     pub intrinsics: Vec<[f64; 4]>,
-    /// Adam's first moments: six of the pose, then one of the focal length's logarithm (the same in every
-    /// row if shared).
+    /// Adam's first moments: six of the pose, then the log of the focal length (shared in all rows).
     pub first: Vec<[f64; 7]>,
     /// Adam's second moments: the pose's as a whole, the focal length's.
     pub second: Vec<[f64; 2]>,
@@ -252,9 +250,8 @@ impl Cameras {
         self.rigs.keep(&mut self.now);
     }
 
-    /// Adam with one second moment for the whole pose: its coordinates have one unit, and the gradient's
-    /// direction is meaningful. One moment per coordinate would move the camera as far along directions
-    /// that the photo hardly constrains.
+    /// Adam with one second moment for the whole pose, whose coordinates have one unit: separate moments
+    /// would move the camera as far along directions that the photo hardly constrains.
     fn adam(&mut self, k: usize, gradient: [f64; 7], rate: f64) -> [f64; 7] {
         let (beta1, beta2, epsilon) = ADAM;
         let bias = |beta: f64| 1.0 - beta.powi(self.state.rounds.min(i32::MAX as u32) as i32);

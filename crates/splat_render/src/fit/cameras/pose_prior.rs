@@ -45,10 +45,7 @@ impl PosePrior {
     }
 
     /// Pulls a camera toward the prior's mean so that a push of `rate` balances one standard deviation
-    /// away.
-    ///
-    /// `scale` converts unit steps to poses; it includes this prior's information, so that no step
-    /// exceeds a standard deviation.
+    /// away. `scale` converts unit steps to poses and includes this prior's information.
     pub fn pull_pose(&self, camera: &mut Camera, scale: &PoseMatrix, rate: f64) {
         if self.pose == [[0.0; POSE]; POSE] {
             return;

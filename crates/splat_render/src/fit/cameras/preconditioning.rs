@@ -1,5 +1,4 @@
-//! Coordinates in which cameras take their steps: each step of length 1 moves the picture of the scene
-//! by one pixel, whichever way it points (CamP, Park et al. 2023).
+//! Coordinates for camera steps: a unit step moves the picture by one pixel (CamP, Park et al. 2023).
 
 use glam::DVec3;
 
@@ -9,8 +8,7 @@ use super::pose_prior::PosePrior;
 use super::rigs::Rigs;
 use crate::camera::Camera;
 
-/// Depths, in units of the scene's, and picture positions, in units of its size, of the points whose
-/// motion in the picture measures a step.
+/// Relative depths and picture positions of the points whose motion measures a step.
 const DEPTHS: [f64; 3] = [0.8, 1.0, 1.25];
 const POSITIONS: [f64; 5] = [0.1, 0.3, 0.5, 0.7, 0.9];
 
@@ -53,8 +51,7 @@ pub(super) fn all_scales(
     (0..cameras.len()).map(|k| rigs.rows_at(k, &scales)).collect()
 }
 
-/// Median depth of the points in a camera's picture; of all points in front of it if there are none; 1 if
-/// all are behind it.
+/// Median depth of the points in a camera's picture; else of all points in front of it; else 1.
 pub fn scene_distance(camera: &Camera, means: &[[f32; 3]]) -> f64 {
     let (w, h) = (f64::from(camera.width), f64::from(camera.height));
     let (mut seen, mut before) = (Vec::new(), Vec::new());

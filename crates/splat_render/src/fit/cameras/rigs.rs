@@ -9,8 +9,7 @@ use super::motion::{POSE, PoseMatrix};
 use crate::camera::Camera;
 use crate::error::{Error, Result};
 
-/// Centers of a rig's cameras are one if they differ by less than this part of how far they are from
-/// the origin, or from each other's scene.
+/// Largest distance between a rig's centers, relative to their distances to origin and scene.
 const ONE_CENTER: f64 = 1e-5;
 
 #[derive(Debug, Clone)]
@@ -78,8 +77,7 @@ impl Rigs {
         }
     }
 
-    /// The sum of each rig's matrices over poses, divided by `1` or by the number of its members, in
-    /// the axes of its first camera; other entries stay as they are.
+    /// Sums (or means) of each rig's matrices in its first camera's axes; other entries are unchanged.
     pub(super) fn sums(&self, matrices: &[PoseMatrix], mean: bool) -> Vec<PoseMatrix> {
         let mut out = matrices.to_vec();
         for first in self.firsts() {

@@ -56,12 +56,7 @@ fn adapters(instance: &wgpu::Instance) -> Vec<wgpu::Adapter> {
 
 impl Gpu {
     /// Opens the best adapter: a real GPU if there is one, else, if `software_allowed`, a software
-    /// adapter such as lavapipe. Kernels compile when they are first used; `gpu_check` compiles and tests
-    /// them.
-    ///
-    /// # Errors
-    ///
-    /// [`Error::NoAdapter`] if none answers, [`Error::Device`] if it fails.
+    /// adapter such as lavapipe. Kernels compile when they are first used.
     pub fn new(software_allowed: bool) -> Result<Self> {
         Self::with_faults(software_allowed, &Injected::default())
     }
@@ -91,8 +86,7 @@ impl Gpu {
         Self::open(adapter, injected)
     }
 
-    /// Opens the best adapter that can draw in a window, if necessary a software one, and the window's
-    /// surface on it.
+    /// Opens the best adapter that can draw in a window, and the window's surface.
     pub fn for_window(
         window: impl Into<wgpu::SurfaceTarget<'static>>,
     ) -> Result<(Self, wgpu::Adapter, wgpu::Surface<'static>)> {
@@ -133,8 +127,7 @@ impl Gpu {
             (true, true) => sharing,
             (true, false) => plain,
         };
-        // Accept limits below WebGPU's defaults if the kernels do not need them. Scenes profit from large
-        // buffers.
+        // Accept limits below WebGPU's defaults if the kernels do not need them; request large buffers.
         let required_limits = wgpu::Limits {
             max_storage_buffer_binding_size: offered.max_storage_buffer_binding_size,
             max_buffer_size: offered.max_buffer_size,

@@ -52,8 +52,7 @@ pub(in crate::gpu) enum Op {
         groups: Groups,
     },
     Clear(wgpu::Buffer),
-    /// Copies this many bytes (the last field) from the start of the first buffer to an offset in the
-    /// second.
+    /// Copies bytes (last field) from the start of the first buffer to an offset in the second.
     Copy(wgpu::Buffer, wgpu::Buffer, u64, u64),
 }
 
@@ -138,8 +137,7 @@ impl Gpu {
         [x, groups.div_ceil(x)]
     }
 
-    /// Splats `begin..end` of each dispatch, so that `bytes_per_splat` times their number can be
-    /// bound at once.
+    /// Ranges of splats so small that `bytes_per_splat` times their number can be bound at once.
     pub(in crate::gpu) fn windows(&self, splats: u32, bytes_per_splat: u64) -> Vec<Range<u32>> {
         let fit = (self.binding_limit / bytes_per_splat).min(u64::from(u32::MAX / 2)) as u32;
         let step = (fit / SPLATS_PER_GROUP).max(1) * SPLATS_PER_GROUP;

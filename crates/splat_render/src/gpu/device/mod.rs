@@ -81,8 +81,7 @@ impl Gpu {
         self
     }
 
-    /// Keeps tiles from sharing through subgroups, which not every device can, so that tests see
-    /// both ways.
+    /// Disables subgroups, so that tests cover both ways.
     #[must_use]
     pub fn without_subgroups(mut self) -> Self {
         self.build.subgroups = false;
@@ -226,8 +225,7 @@ impl Gpu {
         })
     }
 
-    /// Returns the first error that wgpu reported since the last call; always an error once the device is
-    /// lost.
+    /// The first error since the last call; always an error once the device is lost.
     pub fn check(&self) -> Result<()> {
         let failure = self.failure.lock().ok().and_then(|mut f| f.take());
         if self.is_lost() {

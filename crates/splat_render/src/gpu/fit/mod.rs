@@ -64,8 +64,7 @@ pub struct GpuFit {
     scene: Option<Scene>,
     /// MCMC's table of shares; None until density control runs.
     shares: Option<wgpu::Buffer>,
-    /// Submitted steps that are not confirmed yet, each with the number of steps that colors waited for
-    /// before it.
+    /// Submitted, unconfirmed steps, each with the number of steps that colors waited for before it.
     pending: Vec<(StepInput, usize)>,
     /// While pending steps are done again: the last of them that was submitted again.
     redone: Option<usize>,
@@ -120,9 +119,8 @@ impl GpuFit {
         }
     }
 
-    /// Sets the number of steps that colors of unseen splats may wait, by default
-    /// [`COLOR_WAIT`](crate::fit::COLOR_WAIT); with 1, every step updates all colors. The bits do not
-    /// change.
+    /// Limits the steps that colors of unseen splats wait, by default to
+    /// [`COLOR_WAIT`](crate::fit::COLOR_WAIT). The bits do not change.
     pub fn with_color_wait(self, steps: usize) -> Self {
         Self { waiting: WaitingSteps::at_most(steps), ..self }
     }
@@ -312,8 +310,7 @@ impl GpuFit {
         };
         let settled = self.redo(&pending, first);
         if let Err(error) = settled.and_then(|()| self.read_sums(&pending)) {
-            // The next call that reads the state gets this error again, and not a state without these
-            // steps.
+            // The next read of the state reports this error again.
             self.pending = pending;
             return Err(error);
         }

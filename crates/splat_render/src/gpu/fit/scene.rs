@@ -100,8 +100,7 @@ impl Scene {
         self.adam.moving == self.len() && u64::from(splats) * 4 * floats <= gpu.binding_limit
     }
 
-    /// The scene after a run of MCMC's density control; None if an array exceeds a binding or some splats
-    /// are frozen.
+    /// The scene after MCMC's density control; None if an array exceeds a binding or splats are frozen.
     pub fn after_mcmc(
         &self,
         gpu: &Gpu,
@@ -134,8 +133,7 @@ impl Scene {
         Ok(next)
     }
 
-    /// A new scene for the result of a density control, and the commands that fill it; statistics are
-    /// reset.
+    /// A new scene after density control, and the commands that fill it; statistics are reset.
     pub fn arranged(&self, gpu: &Gpu, drawn: &Drawn, tiles: u32) -> Result<(Self, Vec<Op>)> {
         let AdamBuffers { splats, first, second, .. } = &self.adam;
         let floats = [GEOMETRY as u32, splats.color_floats as u32];

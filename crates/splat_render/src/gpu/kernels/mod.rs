@@ -24,8 +24,7 @@ pub(super) enum Access {
 /// Build parameters of the shaders for one kind of adapter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Build {
-    /// Pixel rows per thread of the rasterize kernels: few on real GPUs, many on software adapters,
-    /// for which reading a splat costs more than blending it.
+    /// Pixel rows per thread of the rasterize kernels; many on software adapters, which read slowly.
     pub rows: u32,
     /// Whether a tile's threads are one subgroup and share data through it.
     pub subgroups: bool,
@@ -37,8 +36,7 @@ pub(super) struct Build {
 }
 
 impl Build {
-    /// For GPUs, for software adapters whose subgroups are a tile's threads, and for other software
-    /// adapters.
+    /// For GPUs, and for software adapters with and without subgroups of a tile's threads.
     pub const ALL: [Self; 3] = [
         Self { rows: 2, subgroups: false, digit_bits: 8, loss_by_lines: false, segments: 256 },
         Self { rows: 8, subgroups: true, digit_bits: 4, loss_by_lines: true, segments: 16 },
@@ -57,15 +55,13 @@ pub(super) struct Source {
     pub bindings: &'static [Access],
     /// Texts after [`SHARED`].
     parts: &'static [&'static str],
-    /// Text for the threads of a tile that work together: for any device, and for one whose tiles are
-    /// one subgroup each.
+    /// Text for cooperating threads of a tile: for any device, and for tiles that are subgroups.
     tile_work: Option<[&'static str; 2]>,
     /// Whether the source has the override `SEGMENTS`.
     segmented: bool,
 }
 
-/// The structs, constants and functions that all shaders share, such as `Splat2d`, for callers that
-/// draw from the kernels' buffers.
+/// WGSL declarations such as `Splat2d`, for callers that draw from the kernels' buffers.
 pub fn shared_wgsl() -> String {
     constants(1) + SHARED
 }
@@ -90,8 +86,7 @@ pub struct ShaderVariant {
     pub constants: Vec<(&'static str, f64)>,
 }
 
-/// Every shader in every variant that some adapter compiles, for tests that translate them to the
-/// languages of all drivers.
+/// Every shader in every variant, for tests that translate them to the drivers' languages.
 pub fn shader_variants() -> impl Iterator<Item = ShaderVariant> {
     Build::ALL.into_iter().flat_map(|build| {
         sources().map(move |source| ShaderVariant {

@@ -122,8 +122,7 @@ const TILE_SUMS: [&str; 2] = [
         include_str!("../shaders/tile_sums_subgroup.wgsl")
     ),
 ];
-// The backward kernels exist with and without sums of absolute gradients: most callers do not need the
-// sums.
+// The backward kernels exist with and without sums of absolute gradients, which are rarely needed.
 const SIGNED: &str = "const SUMS = GRADIENT;\n";
 const ABSOLUTE: &str = "const SUMS = GRADIENT_ABSOLUTE;\n";
 

@@ -1,7 +1,5 @@
-// exposure and exposure_backward: a picture's colors as a photo of some gain and offset has them,
-// and back from the gradients of those colors to the picture's. Sums of gain and offset: each
-// thread adds up pixels that lie a stride apart, a workgroup its threads in order, the host the groups.
-// Follows shared.wgsl.
+// exposure and exposure_backward: a photo's gain and offset. Each thread sums pixels at a stride, a
+// workgroup its threads in order, the host the groups. Follows shared.wgsl.
 
 // Fourth components are unused except background's: 1 if the photo has alpha and keeps its background.
 struct Exposure {

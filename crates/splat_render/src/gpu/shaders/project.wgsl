@@ -1,5 +1,4 @@
-// project: splats and camera to 2D splats. Follows geometry.wgsl; in fits also waiting_colors.wgsl, which
-// brings colors up to date before they are evaluated.
+// project: splats and camera to 2D splats. Follows geometry.wgsl; in fits also waiting_colors.wgsl.
 
 // Of culled splats, the radii alone.
 @group(0) @binding(4) var<storage, read_write> splats2d: array<Splat2d>;

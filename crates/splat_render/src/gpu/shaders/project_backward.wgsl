@@ -1,5 +1,4 @@
-// project_backward: gradients of the 2D splats to gradients of the splats and the camera. Follows
-// splat_backward.wgsl.
+// project_backward: gradients of splats and camera. Follows splat_backward.wgsl.
 
 @group(0) @binding(4) var<storage, read> splats2d: array<Splat2d>;
 // GRADIENT floats per splat: mean 2, factor 3, depth, color 3, opacity.

@@ -1,5 +1,4 @@
-// Sharing a tile's splats among its threads, on any device: each thread reads every splat from storage
-// (staging them in workgroup memory was slower). tile_subgroup.wgsl is the alternative.
+// Each thread of a tile reads every splat from storage: for any device (see tile_subgroup.wgsl).
 
 // Pairs that are read at once.
 const AHEAD = 1u;

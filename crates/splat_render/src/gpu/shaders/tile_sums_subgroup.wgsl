@@ -1,5 +1,4 @@
-// Sums over the threads of a tile that are one subgroup: thread b keeps and writes the sums of a batch's
-// splat b.
+// Sums over a tile that is one subgroup: thread b writes the sums of a batch's splat b.
 
 const BATCH = AHEAD;
 

@@ -1,7 +1,5 @@
-// Colors that wait: a step leaves a splat's colors as they are and keeps their gradient, and when the
-// splat is next projected, that step and all that followed without a gradient are done in one go. So
-// colors and moments of splats out of sight are neither read nor written. As cpu/waiting_colors.rs.
-// Follows geometry.wgsl and adam_step.wgsl.
+// Colors that wait: a step keeps a splat's color gradient, and all waiting steps are done in one go when
+// the splat is next projected. As cpu/waiting_colors.rs. Follows geometry.wgsl and adam_step.wgsl.
 
 // The steps that colors may wait for.
 struct ColorSteps {

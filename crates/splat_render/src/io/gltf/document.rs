@@ -84,8 +84,7 @@ impl<'a> Document<'a> {
         Ok((bytes, number(view, "byteStride")))
     }
 
-    /// The place in `stores` of buffer `k`'s bytes. Of other files, `files` knows the place: many
-    /// buffers may share one, which is in memory once.
+    /// The index in `stores` of buffer `k`'s bytes; `files` caches other files' indices.
     fn buffer(
         &mut self,
         k: usize,

@@ -6,8 +6,7 @@ use serde_json::Value;
 use super::document::{Document, number};
 use crate::error::Result;
 
-/// By how much the axes of a node may differ in length and from right angles, relatively: float32
-/// matrices are off by less.
+/// Relative tolerance of a node's axes in length and angle; float32 matrices are within it.
 const SHAPE_TOLERANCE: f64 = 1e-4;
 
 pub struct Placed {

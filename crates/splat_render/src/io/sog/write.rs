@@ -37,8 +37,7 @@ pub fn encode(file: &SplatFile, notes: &mut Vec<String>) -> Result<Vec<u8>> {
     zipped(&files).map_err(|e| unfit(&format!("cannot be zipped ({e})")))
 }
 
-/// Writes `meta.json` and its images into a folder that is there. The splats keep their order; all are
-/// finite, and of a degree up to 3.
+/// Writes a SOG into an existing folder. Splats keep their order; all are finite, degree at most 3.
 pub fn write_folder(folder: &Path, splats: &SplatArrays, antialiased: bool) -> Result<()> {
     for (name, bytes) in files(splats, antialiased)? {
         let path = folder.join(name);
