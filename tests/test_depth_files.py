@@ -171,7 +171,7 @@ def bad_files() -> dict[str, tuple[str, object, str]]:
             + b"{'descr': '<f4', 'fortran_order': False, 'shape': (900000, 900000), }".ljust(118),
             "cannot be read as depth",
         ),
-        "no EXR": ("1.exr", b"v/1\x01 no more", "cannot be read as depth: file: is no OpenEXR"),
+        "no EXR": ("1.exr", b"v/1\x01 no more", "cannot be read as depth: file: is not an OpenEXR"),
         "nothing at all": ("1.exr", b"", "cannot be read as depth"),
     }
 

@@ -34,7 +34,7 @@ def faults_end(monkeypatch, verdicts):
     [
         ("shader", "Shader"),
         ("values", "computes wrong values: rasterize is off by"),
-        ("limits", "max_storage_buffers_per_shader_stage is 4 where igsr needs 8"),
+        ("limits", "max_storage_buffers_per_shader_stage is 4, but igsr needs 8"),
     ],
 )
 def test_auto_warns_once_and_takes_the_cpu(fault, words):

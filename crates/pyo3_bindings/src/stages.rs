@@ -374,7 +374,7 @@ fn project_backward_with<'py, T: Real>(
     };
     if projected.len() != params.len() {
         return Err(PyValueError::new_err(format!(
-            "projected: has {} splats where means has {}",
+            "projected: has {} splats, but means has {}",
             projected.len(),
             params.len()
         )));

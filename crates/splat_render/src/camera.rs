@@ -29,7 +29,7 @@ pub(crate) fn check_size(width: u32, height: u32) -> Result<()> {
     if width == 0 || height == 0 || width > SIDE_MAX || height > SIDE_MAX {
         return Err(Error::argument(
             "width, height",
-            format!("must lie in 1..={SIDE_MAX}, got {width} x {height}"),
+            format!("must be in 1..={SIDE_MAX}, got {width} x {height}"),
         ));
     }
     Ok(())

@@ -60,10 +60,7 @@ impl<T> SplatParams<'_, T> {
         ];
         for (name, length) in lengths {
             if length != n {
-                return Err(Error::argument(
-                    name,
-                    format!("has {length} rows where means has {n}"),
-                ));
+                return Err(Error::argument(name, format!("has {length} rows, but means has {n}")));
             }
         }
         let rows = match self.colors {
@@ -74,7 +71,8 @@ impl<T> SplatParams<'_, T> {
                     return Err(Error::argument(
                         "sh_degree",
                         format!(
-                            "degree {degree} needs {needed} coefficients of at most {SH_COEFFS_MAX}, got {stride}"
+                            "degree {degree} needs {needed} coefficients of at most \
+                             {SH_COEFFS_MAX}, got {stride}"
                         ),
                     ));
                 }
@@ -85,7 +83,7 @@ impl<T> SplatParams<'_, T> {
             }
         };
         if rows != n {
-            return Err(Error::argument("colors", format!("has {rows} rows where means has {n}")));
+            return Err(Error::argument("colors", format!("has {rows} rows, but means has {n}")));
         }
         Ok(())
     }

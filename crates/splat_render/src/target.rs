@@ -39,10 +39,10 @@ impl TargetDepth {
     /// Checks sizes and values; the error continues the photo's name.
     pub(crate) fn validate(&self, pixels: usize) -> std::result::Result<(), &'static str> {
         if self.depths.len() != pixels || self.confidences.len() != pixels {
-            return Err("has depths that are not of the image's size");
+            return Err("has depths of another size than the image");
         }
         if !self.confidences.iter().all(|c| (0.0..=1.0).contains(c)) {
-            return Err("has a depth's confidence that does not lie in 0..=1");
+            return Err("has a depth's confidence outside of 0..=1");
         }
         let mut known = self.depths.iter().zip(&self.confidences).filter(|(_, c)| **c > 0.0);
         if !known.all(|(z, _)| z.is_finite() && *z >= f32::MIN_POSITIVE) {
@@ -118,7 +118,7 @@ impl Target {
             return bad("does not hold width x height pixels".into());
         }
         if self.background.is_some_and(|color| color.iter().any(|c| !(0.0..=1.0).contains(c))) {
-            return bad("has a background that does not lie in 0..=1".into());
+            return bad("has a background outside of 0..=1".into());
         }
         if self.turns == 0 {
             return bad("has no turn; give at least one".into());
@@ -246,7 +246,7 @@ mod tests {
     }
 
     #[test]
-    fn a_reduced_photo_has_the_mean_of_what_counts() {
+    fn a_reduced_photo_has_weighted_means() {
         let plain = photo(3, (0..18).map(|i| 10 * i as u8).collect(), None).reduced(2);
         assert_eq!((plain.width, plain.height, plain.turns, plain.until), (1, 1, 2, Some(7)));
         // Pixels 0, 1, 3 and 4; the last column is left over.

@@ -1,5 +1,4 @@
-//! What becomes of callers when an adapter fails: each fault is injected, and its message, what is kept
-//! and what works afterwards are looked at.
+//! Injected faults of an adapter: the error message, the state that is kept, and recovery.
 
 mod common;
 
@@ -58,7 +57,7 @@ fn an_adapter_below_the_limits_is_refused_by_the_limit() {
     let injected = Injected::default().with_low_limits();
     let found = message(Gpu::with_faults(true, &injected).map(drop));
     assert!(
-        found.contains("max_storage_buffers_per_shader_stage is 4 where igsr needs 8"),
+        found.contains("max_storage_buffers_per_shader_stage is 4, but igsr needs 8"),
         "{found}"
     );
 }
@@ -108,7 +107,7 @@ impl Fit {
 }
 
 #[test]
-fn a_device_lost_in_mid_fit_is_one_message_and_the_next_one_works() {
+fn a_lost_device_is_one_message_and_the_next_device_works() {
     let gpu = Arc::new(Gpu::new(true).unwrap());
     let mut fit = Fit::new(&gpu, 100);
     (1..20).for_each(|step| fit.step(step).unwrap());
@@ -130,7 +129,7 @@ fn a_device_lost_in_mid_fit_is_one_message_and_the_next_one_works() {
 }
 
 #[test]
-fn growth_beyond_the_memory_is_one_message_and_changes_no_step_in_silence() {
+fn growth_beyond_the_memory_is_one_message() {
     let injected = Injected { buffer_bytes: Some(600_000), ..Injected::default() };
     let gpu = Arc::new(faulty(&injected));
     // Splats as wide as the picture: the pairs of those before the camera outgrow the first guess of four per splat.
@@ -150,7 +149,7 @@ fn growth_beyond_the_memory_is_one_message_and_changes_no_step_in_silence() {
 }
 
 #[test]
-fn density_control_beyond_the_memory_is_one_message_and_leaves_the_splats() {
+fn density_control_beyond_the_memory_is_one_message_and_keeps_the_splats() {
     let injected = Injected { buffer_bytes: Some(600_000), ..Injected::default() };
     let gpu = Arc::new(faulty(&injected));
     let mut fit = Fit::new(&gpu, 2000);
@@ -212,6 +211,6 @@ fn a_submission_that_fails_loses_no_step_and_repeats_none() {
         failed += 1;
     }
     gpu.fail_submission(0);
-    // Four steps, the status, the steps again, each with a status of its own.
+    // Four steps, the status, the steps again, each with a separate status.
     assert!(failed >= 4 + 1 + 2 * 4, "{failed}");
 }

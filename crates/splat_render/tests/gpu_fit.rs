@@ -1,11 +1,13 @@
 //! Fitting on the GPU against fitting on the CPU, from the same start with the same draws.
 
+#[macro_use]
 mod common;
 
 use std::sync::{Arc, OnceLock};
 
 use common::*;
 use rand::Rng;
+use splat_render::Camera;
 use splat_render::cpu::CpuFit;
 use splat_render::fit::{
     DensityControl, Exposure, FitConfig, FitDevice, FitState, Fitter, Rates, StepInput, Target,
@@ -13,8 +15,6 @@ use splat_render::fit::{
 };
 use splat_render::gpu::{Gpu, GpuFit};
 use splat_render::reference::Reference;
-use splat_render::stages::ProjectOptions;
-use splat_render::{Camera, Stages};
 
 /// Photos of a random scene, their cameras, and another random scene to start from.
 struct Capture {
@@ -29,9 +29,7 @@ fn capture(seed: u64, sizes: &[(u32, u32)], splats: usize) -> Capture {
     let (mut targets, mut cameras) = (Vec::new(), Vec::new());
     for (k, &(width, height)) in sizes.iter().enumerate() {
         let camera = random_camera(&mut rng, width, height);
-        let projected =
-            Reference.project(&truth.params(), &camera, &ProjectOptions::default()).unwrap();
-        let image = Reference.rasterize(&projected, [0.0; 3]).unwrap();
+        let image = render(&Reference, &truth.params(), &camera, [0.0; 3]);
         let byte = |v: f64| (v.clamp(0.0, 1.0) * 255.0).round() as u8;
         let rgba = k % 2 == 0;
         let mut pixels = Vec::new();
@@ -59,7 +57,7 @@ fn input(capture: &Capture, step: u32, noise: f32) -> StepInput {
     let view = step as usize % capture.cameras.len();
     let t = step as f32 * 0.37;
     StepInput {
-        // Photos with alpha stand on a background that moves, the others on black.
+        // Photos with alpha have a changing background, opaque ones black.
         background: if view.is_multiple_of(2) {
             [t.fract(), (2.0 * t).fract(), 0.5]
         } else {
@@ -78,14 +76,18 @@ fn input(capture: &Capture, step: u32, noise: f32) -> StepInput {
     }
 }
 
+fn begin(device: &mut dyn FitDevice, capture: &Capture) {
+    device.set_targets(capture.targets.clone()).unwrap();
+    device.upload(capture.start.clone()).unwrap();
+}
+
 fn run(
     device: &mut dyn FitDevice,
     capture: &Capture,
     steps: u32,
     noise: f32,
 ) -> (FitState, Vec<f32>) {
-    device.set_targets(capture.targets.clone()).unwrap();
-    device.upload(capture.start.clone()).unwrap();
+    begin(device, capture);
     let mut losses = Vec::new();
     for step in 1..=steps {
         device.step(&input(capture, step, noise)).unwrap();
@@ -140,23 +142,10 @@ fn shared() -> Arc<Gpu> {
 
 /// PSNR over all photos, rendered by the reference on black.
 fn psnr(capture: &Capture, state: &FitState) -> f64 {
-    let splats = &state.splats;
-    let wide = Scene::<f32> {
-        means: splats.means.clone(),
-        quats: splats.quats.clone(),
-        scales: splats.scales.clone(),
-        opacities: splats.opacities.clone(),
-        colors: splats.sh.clone(),
-        sh_degree: splats.sh_degree,
-        sh_stride: splats.stride(),
-        raw: true,
-    }
-    .widen();
+    let wide = narrowed::widened(&state.splats.params(state.splats.sh_degree));
     let (mut total, mut count) = (0.0, 0);
     for (target, camera) in capture.targets.iter().zip(&capture.cameras) {
-        let projected =
-            Reference.project(&wide.params(), camera, &ProjectOptions::default()).unwrap();
-        let image = Reference.rasterize(&projected, [0.0; 3]).unwrap();
+        let image = render(&Reference, &wide.params(), camera, [0.0; 3]);
         let mut photo = vec![0.0; target.width as usize];
         for (row, colors) in image.color.chunks(photo.len()).enumerate() {
             for c in 0..3 {
@@ -169,6 +158,14 @@ fn psnr(capture: &Capture, state: &FitState) -> f64 {
         }
     }
     -10.0 * (total / f64::from(count)).log10()
+}
+
+/// Asserts that fits on both devices improve the picture alike.
+fn assert_improved(capture: &Capture, cpu: &FitState, gpu: &FitState) {
+    let [before, cpu, gpu] = [&capture.start, cpu, gpu].map(|state| psnr(capture, state));
+    println!("start {before:.3} dB, cpu {cpu:.3} dB, gpu {gpu:.3} dB");
+    assert!(cpu > before + 3.0, "the fit must improve the picture");
+    assert!((cpu - gpu).abs() <= 0.1);
 }
 
 #[test]
@@ -210,8 +207,7 @@ fn cameras_get_the_gradients_that_they_get_on_the_cpu() {
     let still =
         |step: u32| StepInput { rates: Rates::ZERO, noise: 0.0, ..input(&capture, step, 0.0) };
     let rows = |device: &mut dyn FitDevice| {
-        device.set_targets(capture.targets.clone()).unwrap();
-        device.upload(capture.start.clone()).unwrap();
+        begin(device, &capture);
         let mut rows = Vec::new();
         for step in 1..=steps {
             device.step(&still(step)).unwrap();
@@ -246,8 +242,7 @@ fn exposures_get_the_gradients_that_they_get_on_the_cpu() {
         StepInput { exposure: (step % 7 != 3).then_some(exposure), ..input }
     };
     let rows = |device: &mut dyn FitDevice| {
-        device.set_targets(capture.targets.clone()).unwrap();
-        device.upload(capture.start.clone()).unwrap();
+        begin(device, &capture);
         let mut losses = Vec::new();
         for step in 1..=steps {
             device.step(&still(step)).unwrap();
@@ -275,7 +270,7 @@ fn exposures_get_the_gradients_that_they_get_on_the_cpu() {
     }
 }
 
-/// Gives all photos but the second random depths near what is there; some are not known.
+/// Random depths for all photos except the second; some are unknown.
 fn with_depths(mut capture: Capture) -> Capture {
     let mut rng = rng(77);
     for (k, target) in capture.targets.iter_mut().enumerate() {
@@ -289,7 +284,7 @@ fn with_depths(mut capture: Capture) -> Capture {
 }
 
 #[test]
-fn depths_count_as_on_the_cpu_and_repeat_themselves() {
+fn depths_count_as_on_the_cpu_and_repeat() {
     // Photos with depths and one without; now and then a step to which depths are nothing.
     let steps = 40;
     let mut capture = with_depths(capture(3, &[(64, 64), (50, 70), (64, 64)], 400));
@@ -328,14 +323,10 @@ fn depths_count_as_on_the_cpu_and_repeat_themselves() {
 #[test]
 fn a_fit_ends_as_on_the_cpu_and_repeats_itself() {
     let capture = capture(2, &[(64, 64); 6], 150);
-    let before = psnr(&capture, &capture.start);
     let (expected, expected_losses) = run(&mut CpuFit::default(), &capture, 200, 0.0);
     let (got, losses) = run(&mut gpu_fit(), &capture, 200, 0.0);
-    let (cpu_psnr, gpu_psnr) = (psnr(&capture, &expected), psnr(&capture, &got));
-    println!("start {before:.3} dB, cpu {cpu_psnr:.3} dB, gpu {gpu_psnr:.3} dB");
     println!("losses: cpu {expected_losses:?}, gpu {losses:?}");
-    assert!(cpu_psnr > before + 3.0, "the fit must improve the picture");
-    assert!((cpu_psnr - gpu_psnr).abs() <= 0.1);
+    assert_improved(&capture, &expected, &got);
     let (again, losses_again) = run(&mut gpu_fit(), &capture, 200, 0.0);
     assert!(got == again && losses == losses_again, "the same fit twice gave other bits");
 }
@@ -366,13 +357,9 @@ fn a_fit_that_clones_splits_and_prunes_ends_as_on_the_cpu_and_repeats_itself() {
     };
     let (expected, cpu_counts) = fit(Box::<CpuFit>::default());
     let (got, counts) = fit(Box::new(gpu_fit()));
-    let before = psnr(&capture, &capture.start);
-    let (cpu_psnr, gpu_psnr) = (psnr(&capture, &expected), psnr(&capture, &got));
-    println!("start {before:.3} dB, cpu {cpu_psnr:.3} dB, gpu {gpu_psnr:.3} dB");
     println!("splats: cpu {cpu_counts:?}, gpu {counts:?}");
     assert!(counts.len() > 2 && counts.iter().any(|&n| n > 110), "{counts:?}");
-    assert!(cpu_psnr > before + 3.0, "the fit must improve the picture");
-    assert!((cpu_psnr - gpu_psnr).abs() <= 0.1);
+    assert_improved(&capture, &expected, &got);
     let again = fit(Box::new(gpu_fit()));
     assert!((got, counts) == again, "the same fit twice gave other bits");
 }
@@ -422,18 +409,16 @@ fn missing_splats_photos_and_sizes_are_named() {
     assert!(error.starts_with("view: "), "{error}");
 }
 
-/// A step makes no buffer, bind group or pipeline, and what a fit holds per splat stays within its
-/// stated sum.
+/// A step makes no buffer, bind group or pipeline, and memory per splat stays within the documented sum.
 #[test]
 fn steps_allocate_nothing_and_memory_grows_as_stated() {
-    // Its own device, since it counts what is made.
+    // A separate device, because it counts allocations.
     let gpu = Arc::new(gpu());
     let bytes_of = |splats: usize| {
         let capture = capture(5, &[(64, 48), (50, 50)], splats);
         let (_, before) = gpu.made();
         let mut fit = GpuFit::new(Arc::clone(&gpu));
-        fit.set_targets(capture.targets.clone()).unwrap();
-        fit.upload(capture.start.clone()).unwrap();
+        begin(&mut fit, &capture);
         let (_, bytes) = gpu.made();
         for step in 1..=10 {
             fit.step(&input(&capture, step, 0.0)).unwrap();
@@ -459,22 +444,14 @@ fn steps_allocate_nothing_and_memory_grows_as_stated() {
 }
 
 #[test]
-fn frozen_steps_keep_the_moments() {
-    common::agreement::frozen_steps_keep_the_moments(&mut GpuFit::new(shared()));
-}
-
-#[test]
-fn the_last_splats_stay() {
-    common::agreement::the_last_splats_stay(&mut GpuFit::new(shared()));
-}
-
-#[test]
-fn senseless_steps_are_refused() {
-    common::agreement::senseless_steps_are_refused(&mut GpuFit::new(shared()));
-}
-
-#[test]
 fn waiting_colors_end_with_the_same_bits() {
     let device = |most| GpuFit::new(shared()).with_color_wait(most);
     common::waiting::waiting_colors_end_with_the_same_bits(device);
+}
+
+checks! {
+    [&mut GpuFit::new(shared())];
+    agreement::frozen_steps_keep_the_moments();
+    agreement::the_last_splats_stay();
+    agreement::invalid_steps_are_refused();
 }

@@ -8,7 +8,7 @@ use common::narrowed::Narrowed;
 checks! {
     [&Narrowed];
     hard_cases::no_splats_give_the_background();
-    hard_cases::poison_in_any_slot_culls_one_splat_at_most();
+    hard_cases::an_invalid_number_culls_one_splat_at_most();
     hard_cases::a_zero_quaternion_culls_its_splat();
     hard_cases::thresholds_are_the_same_everywhere();
     properties::any_values_give_finite_results(300);
@@ -20,5 +20,5 @@ checks! {
     optimization::frozen_splats_keep_their_moments();
     agreement::invalid_2d_splats_are_not_drawn();
     agreement::a_near_plane_of_zero_draws_what_is_before_the_camera();
-    agreement::senseless_options_are_refused();
+    agreement::invalid_options_are_refused();
 }

@@ -97,7 +97,7 @@ impl Arguments {
         let mut out = Self::default();
         let mut parser = lexopt::Parser::from_args(words);
         let wrong = |error: lexopt::Error| {
-            Error::argument("splat-view", format!("{error}; splat-view --help lists what it takes"))
+            Error::argument("splat-view", format!("{error}; see splat-view --help"))
         };
         while let Some(word) = parser.next().map_err(wrong)? {
             let name = match word {
@@ -153,7 +153,7 @@ impl Arguments {
         if kinds.iter().filter(|&&given| given).count() > 1 {
             return Err(Error::argument(
                 "--screenshot, --frames, --time",
-                "exclude each other; give one of them",
+                "cannot be combined; give one of them",
             ));
         }
         if self.is_headless() && self.scenes.is_empty() {
@@ -163,7 +163,7 @@ impl Arguments {
             return Err(Error::argument(
                 "SCENE",
                 format!(
-                    "must be one without a window, not {}; leave {} out",
+                    "must be a single scene without a window, not {}; leave {} out",
                     self.scenes.len(),
                     self.scenes[1].display()
                 ),
@@ -172,7 +172,8 @@ impl Arguments {
         if self.drawing != Drawing::Auto && self.is_headless() && self.time.is_none() {
             return Err(Error::argument(
                 "--draw",
-                "applies to the window and to --time; pictures without a window are always rasterized",
+                "applies to the window and to --time; pictures without a window are always \
+                 rasterized",
             ));
         }
         let ending = |path: &PathBuf| path.extension().map(|e| e.to_ascii_lowercase());

@@ -81,7 +81,7 @@ mod tests {
     }
 
     #[test]
-    fn a_recording_goes_on_when_its_places_are_forgotten_and_ends_after_its_last() {
+    fn a_recording_ends_after_its_last_place() {
         let mut path = CameraPath { keys: vec![place(0.0), place(1.0)] };
         let mut recording = Recording::new(&path, 4, PathBuf::new());
         path.keys.clear();

@@ -101,7 +101,7 @@ pub fn read_cameras(path: &Path) -> Result<Vec<CaptureCamera>> {
     let size = opened.metadata().map_err(unreadable)?.len();
     if size > FILE_MAX {
         let reason =
-            format!("is {size} bytes, more than the {FILE_MAX} that are read; name fewer cameras");
+            format!("is {size} bytes, more than the limit of {FILE_MAX}; give fewer cameras");
         return Err(Error::file(&file, reason));
     }
     let mut bytes = Vec::new();

@@ -18,7 +18,7 @@ const HEADER_MAX: usize = 4096;
 
 pub fn read_checkpoint(path: &Path) -> Result<SplatFile> {
     let bad = |what: String| {
-        Error::file(path, format!("is no checkpoint of igsr fit ({what}); give its scene.ply"))
+        Error::file(path, format!("is not a checkpoint of igsr fit ({what}); give its scene.ply"))
     };
     let file = open_file(path)?;
     let mut archive = ZipArchive::new(file).map_err(|e| bad(e.to_string()))?;
@@ -69,7 +69,7 @@ fn read_member<R: Read + Seek>(
     let mut head = [0u8; 10];
     member.read_exact(&mut head).map_err(|e| format!("{name}: {e}"))?;
     if &head[..8] != b"\x93NUMPY\x01\x00" {
-        return Err(format!("{name} is no array that can be read"));
+        return Err(format!("{name} is not a readable array"));
     }
     let length = usize::from(u16::from_le_bytes([head[8], head[9]]));
     if length > HEADER_MAX {

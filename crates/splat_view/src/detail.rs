@@ -50,9 +50,7 @@ impl Detail {
                 0 => Error::file(path, "has no splats; write the levels again"),
                 n => Error::argument(
                     "--budget",
-                    format!(
-                        "of {budget} splats has no room for the coarsest cell, of {n}; give more"
-                    ),
+                    format!("of {budget} splats is less than the coarsest cell's {n}; give more"),
                 ),
             });
         }

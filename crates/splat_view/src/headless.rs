@@ -64,7 +64,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
 
 /// Makes a folder for pictures. A folder with files is refused, so that two turntables do not mix.
 fn make_empty(folder: &Path) -> Result<()> {
-    let unwritable = |e| Error::file(folder, format!("cannot be made ({e}); name another"));
+    let unwritable = |e| Error::file(folder, format!("cannot be created ({e}); name another"));
     std::fs::create_dir_all(folder).map_err(unwritable)?;
     if std::fs::read_dir(folder).map_err(unwritable)?.next().is_some() {
         return Err(Error::file(folder, "is not empty; name a new folder for --frames"));
@@ -81,7 +81,7 @@ fn stages(backend: Backend) -> Result<Arc<dyn Stages<f32>>> {
             Ok(gpu) => Ok(gpu),
             Err(error) => {
                 match error {
-                    Error::NoAdapter(_) => eprintln!("No GPU answers; the CPU draws."),
+                    Error::NoAdapter(_) => eprintln!("No GPU was found; the CPU draws."),
                     error => eprintln!("{error}. The CPU draws."),
                 }
                 Ok(Arc::new(Cpu))

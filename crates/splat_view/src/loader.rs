@@ -74,7 +74,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_was_forgotten_while_it_was_read_is_not_shown() {
+    fn a_file_removed_while_it_is_read_is_not_shown() {
         let mut loader = Loader::new(None);
         let (there, done) = channel();
         for (side, name) in [(1, "no such file"), (0, "nor this")] {

@@ -3,9 +3,9 @@
 use std::time::{Duration, Instant};
 
 /// Most notes at a time.
-const MOST: usize = 6;
+const NOTES_MAX: usize = 6;
 /// How long a note stays at least once others follow.
-const STAYS: Duration = Duration::from_secs(60);
+const SHOWN_FOR: Duration = Duration::from_secs(60);
 
 #[derive(Debug, Clone)]
 struct Note {
@@ -20,7 +20,7 @@ pub struct Notes(Vec<Note>);
 
 impl Notes {
     /// Shows a result, a warning or an error. Empty texts are ignored.
-    pub fn tell(&mut self, text: impl Into<String>) {
+    pub fn show(&mut self, text: impl Into<String>) {
         self.push(text.into(), false, Instant::now());
     }
 
@@ -43,8 +43,8 @@ impl Notes {
         if text.is_empty() {
             return;
         }
-        self.0.retain(|note| note.text != text && now.duration_since(note.since) < STAYS);
-        if self.0.len() == MOST {
+        self.0.retain(|note| note.text != text && now.duration_since(note.since) < SHOWN_FOR);
+        if self.0.len() == NOTES_MAX {
             self.0.remove(0);
         }
         self.0.push(Note { text, since: now, is_state });
@@ -62,10 +62,10 @@ mod tests {
     #[test]
     fn notes_queue_and_states_replace_each_other() {
         let mut notes = Notes::default();
-        notes.tell("3 of 103 splats are broken.");
-        notes.tell("cameras.json: is damaged");
+        notes.show("3 of 103 splats are broken.");
+        notes.show("cameras.json: is damaged");
         notes.tell_state("Camera 0: a.png");
-        notes.tell("");
+        notes.show("");
         notes.tell_state("Camera 1: b.png");
         assert_eq!(
             texts(&notes),
@@ -73,7 +73,7 @@ mod tests {
         );
         assert!(notes.has("cameras.json: is damaged") && !notes.has("Camera 0: a.png"));
         // Said again, it is the newest, and once.
-        notes.tell("3 of 103 splats are broken.");
+        notes.show("3 of 103 splats are broken.");
         assert_eq!(texts(&notes).len(), 3);
         assert_eq!(texts(&notes).last(), Some(&"3 of 103 splats are broken."));
     }
@@ -81,13 +81,13 @@ mod tests {
     #[test]
     fn the_oldest_go_first_by_number_and_by_age() {
         let (mut notes, now) = (Notes::default(), Instant::now());
-        for number in 0..=MOST {
+        for number in 0..=NOTES_MAX {
             notes.push(format!("note {number}"), false, now);
         }
-        assert_eq!(texts(&notes).len(), MOST);
+        assert_eq!(texts(&notes).len(), NOTES_MAX);
         assert_eq!(texts(&notes)[0], "note 1");
         // However old, the last note stays until another follows.
-        notes.push("late".to_owned(), false, now + STAYS);
+        notes.push("late".to_owned(), false, now + SHOWN_FOR);
         assert_eq!(texts(&notes), ["late"]);
     }
 }

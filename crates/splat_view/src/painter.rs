@@ -34,7 +34,7 @@ pub fn check_size(gpu: &Gpu, [width, height]: [u32; 2]) -> Result<()> {
     Err(Error::argument(
         "--size",
         format!(
-            "frames have sides up to {most} on {}, not {width}x{height}; give smaller ones",
+            "sides of frames are up to {most} on {}, not {width}x{height}; give smaller ones",
             gpu.name()
         ),
     ))

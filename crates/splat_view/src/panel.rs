@@ -278,7 +278,7 @@ mod tests {
     }
 
     #[test]
-    fn the_sh_degree_outlasts_a_model_of_a_lower_one() {
+    fn a_lower_model_keeps_the_chosen_sh_degree() {
         let gpu = Arc::new(Gpu::new(true).expect("an adapter, a software one will do"));
         let painter = Painter::new(gpu, wgpu::TextureFormat::Rgba8Unorm).expect("a painter");
         let splats = SplatArrays {

@@ -72,7 +72,7 @@ fn bytes(path: &Path) -> Result<Vec<u8>> {
 }
 
 fn bad(path: &Path, what: impl std::fmt::Display) -> Error {
-    Error::file(path, format!("is no PNG or JPEG that can be read ({what}); convert it to one"))
+    Error::file(path, format!("cannot be read as a PNG or JPEG ({what}); convert it to one"))
 }
 
 fn is_png(bytes: &[u8]) -> bool {
@@ -167,7 +167,7 @@ mod tests {
     }
 
     #[test]
-    fn a_photo_that_is_too_large_is_averaged_and_another_left_as_it_is() {
+    fn only_photos_that_are_too_large_are_averaged() {
         let pixel = |x: u8, y: u8| [10 * x, 100 + 10 * y, 50, 255];
         let rgba: Vec<u8> = (0..2).flat_map(|y| (0..6).flat_map(move |x| pixel(x, y))).collect();
         let photo = Photo { size: [6, 2], rgba: rgba.clone() };
@@ -182,7 +182,7 @@ mod tests {
     }
 
     #[test]
-    fn a_jpeg_is_read_and_what_is_none_is_refused_by_name() {
+    fn a_jpeg_is_read_and_other_files_are_refused_by_name() {
         // 16x8: the left half (200, 40, 30), the right one (20, 60, 180).
         let bytes = include_bytes!("../tests/photo.jpg");
         let path = file("a.jpg", bytes);
@@ -199,7 +199,7 @@ mod tests {
         {
             let path = file(name, bytes);
             let error = read_photo(&path).expect_err(name).to_string();
-            assert!(error.contains(name) && error.contains("no PNG or JPEG"), "{error}");
+            assert!(error.contains(name) && error.contains("a PNG or JPEG"), "{error}");
             std::fs::remove_file(path).expect("clean");
         }
     }

@@ -23,7 +23,7 @@ impl Session {
         self.viewer.settings.background = background(&self.arguments, scene.as_deref());
         let first = first_camera(&self.arguments, &cameras)?;
         self.viewer.cameras = cameras;
-        self.viewer.notes.tell(note.unwrap_or_default());
+        self.viewer.notes.show(note.unwrap_or_default());
         for (side, (source, model)) in start.models.into_iter().enumerate() {
             self.viewer.chosen[side] = Some(source.path.clone());
             let stamp = stamp(&source.path);
@@ -47,12 +47,12 @@ impl Session {
         let (drawable, mut model) = match drawable {
             Ok(both) => both,
             Err(error) => {
-                viewer.notes.tell(error.to_string());
+                viewer.notes.show(error.to_string());
                 return;
             }
         };
         for note in &model.notes {
-            viewer.notes.tell(note);
+            viewer.notes.show(note);
         }
         if let Some((_, cameras)) = self.dropped.take_if(|(dropped, _)| *dropped == path) {
             // A dropped scene replaces the cameras, too, unless it is compared and has none.
@@ -108,7 +108,7 @@ impl Session {
                         shown.drawable = drawable;
                         shown.model.file = file;
                     }
-                    Err(error) => viewer.notes.tell(error.to_string()),
+                    Err(error) => viewer.notes.show(error.to_string()),
                 }
                 self.screen.window.request_redraw();
             }
@@ -184,7 +184,7 @@ impl Session {
                 self.dropped = Some((first.clone(), cameras));
                 self.choose(0, Some(first));
             }
-            Err(error) => self.viewer.notes.tell(error.to_string()),
+            Err(error) => self.viewer.notes.show(error.to_string()),
         }
         self.screen.window.request_redraw();
     }

@@ -64,7 +64,7 @@ impl Screen {
         let size = window.inner_size();
         let mut config = surface
             .get_default_config(&adapter, size.width.clamp(1, most), size.height.clamp(1, most))
-            .ok_or_else(|| failed(format!("{} shows nothing in it", gpu.name())))?;
+            .ok_or_else(|| failed(format!("{} cannot draw in it", gpu.name())))?;
         // Colors are encoded as they are shown, and egui blends them so.
         let formats = surface.get_capabilities(&adapter).formats;
         config.format = formats.iter().copied().find(|f| !f.is_srgb()).unwrap_or(config.format);
@@ -108,7 +108,7 @@ impl Screen {
     pub fn configure(&self) -> Result<()> {
         self.surface.configure(self.gpu.device(), &self.config);
         self.gpu.check().map_err(|e| {
-            Error::Device(format!("the window can no longer be drawn in ({e}); open it again"))
+            Error::Device(format!("the window can no longer be drawn ({e}); open it again"))
         })
     }
 

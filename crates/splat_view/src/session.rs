@@ -153,7 +153,7 @@ impl Session {
             Action::Jump(number) => viewer.jump(number),
             Action::Focus(pixel) => {
                 if !viewer.focus(&mut self.painter, size, pixel)? {
-                    viewer.notes.tell("There is nothing at this point.");
+                    viewer.notes.show("There is nothing at this point.");
                 }
             }
             Action::Screenshot => saving::screenshot(viewer, &mut self.painter, size)?,
@@ -172,7 +172,7 @@ impl Session {
                 let text = error.to_string();
                 // An error of every frame is shown once.
                 if !self.viewer.notes.has(&text) {
-                    self.viewer.notes.tell(text);
+                    self.viewer.notes.show(text);
                     self.screen.window.request_redraw();
                 }
                 Ok(())
@@ -222,7 +222,7 @@ impl Session {
         let recorded = match self.painter.record(encoder, &self.viewer.shot(size), target) {
             // The way that was asked for lacks memory here: another is taken, and the panel says why.
             Err(error) if self.viewer.settings.drawing == Drawing::Rasterizer => {
-                self.viewer.notes.tell(error.to_string());
+                self.viewer.notes.show(error.to_string());
                 self.viewer.settings.drawing = Drawing::Auto;
                 self.screen.window.request_redraw();
                 self.painter.record(encoder, &self.viewer.shot(size), target)
@@ -261,7 +261,7 @@ impl Session {
                 self.photo = Some((number, texture));
             }
             Err(error) => {
-                viewer.notes.tell(error.to_string());
+                viewer.notes.show(error.to_string());
                 viewer.photo_strength = 0.0;
             }
         }

@@ -149,7 +149,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_being_fitted_comes_first() {
+    fn the_newest_scene_comes_first() {
         let folder = folder("fit", &["scene.ply", "checkpoint.npz"]);
         assert_eq!(names_of(&folder), ["scene", "checkpoint"]);
         set_age(&folder.join("scene.ply"), 100);

@@ -152,7 +152,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_camera_is_at_is_fine_and_the_budget_holds() {
+    fn near_cells_are_fine_within_the_budget() {
         let folder = levels("follow");
         let (detail, coarse) =
             Detail::open(&folder.join("levels/lod-meta.json"), 600).expect("open");
@@ -172,7 +172,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_that_goes_is_told_once_and_the_rest_is_drawn() {
+    fn a_deleted_file_is_reported_once_and_the_rest_is_drawn() {
         let folder = levels("gone");
         let (detail, _) = Detail::open(&folder.join("levels/lod-meta.json"), 600).expect("open");
         for entry in std::fs::read_dir(folder.join("levels")).expect("folder").flatten() {

@@ -123,7 +123,7 @@ mod tests {
     }
 
     #[test]
-    fn a_running_fit_s_cameras_are_taken_until_it_writes_its_own() {
+    fn a_running_fit_uses_the_given_cameras_until_it_writes_its_own() {
         let folder = run_folder("running", &[("checkpoint.npz", ""), ("view/cameras.json", "")]);
         let checkpoint = folder.join("checkpoint.npz");
         assert_eq!(cameras_beside(&checkpoint), Some(folder.join("view/cameras.json")));
@@ -133,7 +133,7 @@ mod tests {
     }
 
     #[test]
-    fn the_background_is_that_of_the_fit_or_the_refinement() {
+    fn the_background_is_the_fit_s_or_the_refinement_s() {
         let cases = [
             ("report.json", r#"{"protocol": {"background": [1, 1, 0.5], "x": 1}}"#, true),
             (

@@ -17,7 +17,7 @@ const SAMPLES: usize = 20_000;
 /// A flat splat's shortest axis is at most so long, of the middle one.
 const FLAT: f64 = 0.4;
 /// Cosine of the angle, 12 degrees, within which directions are alike.
-const ALIKE: f64 = 0.978;
+const PARALLEL: f64 = 0.978;
 const DIRECTIONS: usize = 1500;
 /// Maximum bonus of a convention's direction.
 const BONUS: f64 = 1.0;
@@ -69,7 +69,7 @@ fn estimated(flakes: &[Flake]) -> Option<DVec3> {
         return None;
     }
     let along = |direction: DVec3| {
-        flakes.iter().filter(move |flake| flake.normal.dot(direction).abs() > ALIKE)
+        flakes.iter().filter(move |flake| flake.normal.dot(direction).abs() > PARALLEL)
     };
     let score = |direction: DVec3| {
         let usual = CONVENTIONS.iter().map(|up| up.dot(direction).abs()).fold(0.0, f64::max);
@@ -82,7 +82,7 @@ fn estimated(flakes: &[Flake]) -> Option<DVec3> {
         .max_by(|(one, _), (other, _)| one.total_cmp(other))?
         .1;
     // Directions within the angle cover this part of the sphere's halves.
-    let by_chance = total * (1.0 - ALIKE);
+    let by_chance = total * (1.0 - PARALLEL);
     let weight: f64 = along(best).map(|flake| flake.weight).sum();
     if weight < MIN_WEIGHT * by_chance || along(best).count() < MIN_SPLATS {
         return None;
@@ -93,7 +93,7 @@ fn estimated(flakes: &[Flake]) -> Option<DVec3> {
     // The scene stands on the plane: up is the side with the rest of the splats. Medians, since few
     // photos leave large splats below at arbitrary places.
     let height = |is_ground: bool| {
-        let there = |flake: &&Flake| (flake.normal.dot(best).abs() > ALIKE) == is_ground;
+        let there = |flake: &&Flake| (flake.normal.dot(best).abs() > PARALLEL) == is_ground;
         median(flakes.iter().filter(there).map(|flake| flake.at.dot(up)).collect())
     };
     Some(if height(false) < height(true) { -up } else { up })
@@ -148,7 +148,7 @@ mod tests {
     }
 
     #[test]
-    fn up_is_the_side_of_the_floor_that_things_stand_on() {
+    fn up_is_the_side_of_the_floor_with_objects() {
         for up in [DVec3::NEG_Y, DVec3::Z, DVec3::X, DVec3::new(0.3, -0.8, -0.5).normalize()] {
             let found = up_of_splats(&room(up), DVec3::ZERO, 1.0);
             assert!(found.dot(up) > 0.999, "{found} for {up}");

@@ -166,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn looking_puts_the_target_in_the_middle_with_up_upward() {
+    fn looking_at_a_target_centers_it_with_up_upward() {
         let camera = view().camera([200, 100], 1.0);
         camera.validate().expect("rigid");
         let p = camera.viewmat.transform_point3(DVec3::ZERO);
@@ -207,7 +207,7 @@ mod tests {
     }
 
     #[test]
-    fn zoom_pan_and_focus_move_as_they_say() {
+    fn zoom_pan_and_focus_move_the_camera() {
         let mut moved = view();
         moved.zoom(2.0);
         assert!((moved.distance - 0.5 * view().distance).abs() < 1e-12);

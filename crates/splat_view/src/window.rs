@@ -42,7 +42,7 @@ fn no_display() -> String {
         String::new()
     };
     format!(
-        "no display answers{why}; start splat-view on a desktop, or draw without a window: \
+        "no display was found{why}; start splat-view on a desktop, or draw without a window: \
          --screenshot FILE"
     )
 }

@@ -12,26 +12,25 @@ use std::time::{Duration, Instant};
 use common::dragging::drop_file;
 use common::{
     Folder, Picture, ball, command, draw, program, read_png, refused, write, write_cameras,
+    write_in_levels,
 };
 use glam::{DMat4, DVec3};
 use splat_render::Camera;
-use splat_render::levels::write_levels;
 
 /// Longest that anything may take on a busy machine.
 const PATIENCE: Duration = Duration::from_secs(120);
-/// What a test says where a tool or a library for it is missing.
+/// Hint if a tool or a library is missing.
 const INSTALL: &str = "run `make display`, or install xvfb, xdotool, libxcursor1, libxi6, libxrandr2, \
                        libx11-xcb1 and libxkbcommon-x11-0";
 /// The window's first size; small, since a software adapter draws.
 const SIZE: [usize; 2] = [320, 240];
-/// Bounds on what a window's picture is off the rasterizer's, in 255ths, whatever draws it:
-/// docs/guides/viewing.md has them.
+/// Bounds on a window's difference from the rasterizer, in 255ths (docs/guides/viewing.md).
 const MOST: u8 = 3;
 const MEAN: f64 = 0.5;
-/// The same where the rasterizer draws in the window, too.
+/// The bound if the rasterizer draws in the window.
 const RASTERIZED_MOST: u8 = 1;
 
-/// A display of its own.
+/// A virtual display.
 struct Xvfb {
     server: Child,
     name: String,
@@ -59,7 +58,7 @@ impl Xvfb {
         self.answer(arguments).unwrap_or_else(|text| panic!("xdotool {arguments:?}: {text}"))
     }
 
-    /// What xdotool prints, as an error where it fails.
+    /// xdotool's output, an error if it fails.
     fn answer(&self, arguments: &[&str]) -> Result<String, String> {
         let output = Command::new("xdotool")
             .env("DISPLAY", &self.name)
@@ -86,7 +85,7 @@ impl Xvfb {
         }
     }
 
-    /// What the display shows in its upper left corner, from the file that Xvfb keeps it in.
+    /// The upper left corner of the display, from Xvfb's file.
     fn seen(&self, [width, height]: [usize; 2]) -> Picture {
         let bytes = std::fs::read(self.folder.join("Xvfb_screen0")).expect("the screen");
         let word = |i: usize| {
@@ -161,7 +160,7 @@ impl<'a> Viewer<'a> {
 
     /// A screenshot by key.
     fn shot(&mut self) -> Picture {
-        // What came before is in it: keys are handled in their order.
+        // Keys are handled in order, so earlier ones are in the picture.
         self.key("p");
         self.shots += 1;
         let path = self.folder.join(format!("splat-view-{:03}.png", self.shots));
@@ -291,14 +290,14 @@ fn a_window_draws_orbits_zooms_resizes_and_shows_what_it_saves() {
     let resized = viewer.shot_when("the new size", |shot| shot.size == size);
     agree("after the resize", &resized, &rasterized(&scene, size));
     viewer.shows(&resized);
-    // Double click on a splat beside the middle brings it there.
+    // A double click centers a splat.
     xvfb.xdotool(&["mousemove", "230", "110", "click", "--repeat", "2", "--delay", "20", "1"]);
     let focused = viewer.shot_when("the focus", |shot| shot.apart(&resized).1 > 1.0);
     assert!(middle(&focused)[0] < middle(&resized)[0] - 5.0, "the scene did not move to the left");
 }
 
 #[test]
-fn every_display_is_another_and_keys_move_the_camera() {
+fn all_displays_differ_and_keys_move_the_camera() {
     let (xvfb, folder) = (Xvfb::start(), Folder::new());
     let [scene, _] = scenes(&folder);
     let background = "--background 0.2,0.4,0.6";
@@ -360,7 +359,7 @@ fn two_models_are_compared_at_a_divider_and_changed_files_appear() {
         shot.columns(0, 80).apart(&again.columns(0, 80)).1 < MEAN
     });
     agree("changed", &changed, &again);
-    // A broken file leaves what was there.
+    // A broken file changes nothing.
     std::fs::write(&left, "ply\nthis is none").expect("write");
     std::thread::sleep(Duration::from_secs(1));
     agree("broken", &viewer.shot(), &again);
@@ -382,12 +381,9 @@ fn a_refinement_s_folder_opens_and_a_new_scene_in_it_appears() {
 }
 
 #[test]
-fn a_scene_in_levels_gets_as_fine_as_its_budget_allows_and_follows_the_camera() {
+fn a_scene_in_levels_refines_within_its_budget_and_follows_the_camera() {
     let (xvfb, folder) = (Xvfb::start(), Folder::new());
-    let (scene, levels) = (folder.join("scene.ply"), folder.join("levels"));
-    write(&scene, &ball(3000, 20, [0.8, 0.3, 0.2]));
-    std::fs::create_dir(&levels).expect("a folder");
-    write_levels(&scene, &levels, 3, 200, &mut || true).expect("levels");
+    let levels = write_in_levels(&folder, &ball(3000, 20, [0.8, 0.3, 0.2]));
     let path = folder.join("cameras.json");
     write_cameras(&path, &cameras());
     let options = format!("--cameras {} --budget 1500", path.display());
@@ -436,7 +432,7 @@ fn cameras_are_jumped_to_scenes_dropped_and_recordings_stopped() {
     }
     viewer.key("bracketleft");
     agree("around to the last camera", &viewer.shot(), &expected[2]);
-    // A click at the first camera's frustum, where the last one sees it.
+    // A click at the first camera's frustum in the last camera's picture.
     viewer.key("c");
     let [first, _, last] = cameras();
     let at = last.viewmat.transform_point3(first.center());
@@ -479,7 +475,7 @@ fn cameras_are_jumped_to_scenes_dropped_and_recordings_stopped() {
 }
 
 #[test]
-fn windows_larger_than_any_texture_are_refused_when_asked_for_and_else_go_on() {
+fn windows_larger_than_any_texture_are_refused() {
     let (xvfb, folder) = (Xvfb::start(), Folder::new());
     let [scene, _] = scenes(&folder);
     let mut command = command(&scene, "--size 9000x40");

@@ -191,17 +191,17 @@ impl FitConfig {
         if self.sh_degree > SH_DEGREE_MAX {
             return Err(Error::argument(
                 "sh_degree",
-                format!("must lie in 0..={SH_DEGREE_MAX}, got {}", self.sh_degree),
+                format!("must be in 0..={SH_DEGREE_MAX}, got {}", self.sh_degree),
             ));
         }
         if self.sh_interval == 0 {
             return Err(Error::argument("sh_interval", "must be at least 1"));
         }
         if self.max_splats == 0 || self.max_splats > 1 << 27 {
-            return Err(Error::argument("max_splats", "must lie in 1..=134217728"));
+            return Err(Error::argument("max_splats", "must be in 1..=134217728"));
         }
         if !(0.0..=1.0).contains(&self.ssim_weight) {
-            return Err(Error::argument("ssim_weight", "must lie in 0..=1"));
+            return Err(Error::argument("ssim_weight", "must be in 0..=1"));
         }
         let Rates { means, quats, scales, opacities, sh0, sh_rest } = self.rates;
         let rates = [means, quats, scales, opacities, sh0, sh_rest];
@@ -212,10 +212,10 @@ impl FitConfig {
             return Err(Error::argument("rate_scale", "must be finite and above 0"));
         }
         if !(0.0..=0.9).contains(&self.dropout) {
-            return Err(Error::argument("dropout", "must lie in 0..=0.9"));
+            return Err(Error::argument("dropout", "must be in 0..=0.9"));
         }
         if !(self.means_decay > 0.0 && self.means_decay <= 1.0) {
-            return Err(Error::argument("means_decay", "must lie above 0 and at most at 1"));
+            return Err(Error::argument("means_decay", "must be above 0 and at most 1"));
         }
         if !(self.depth_weight.is_finite() && self.depth_weight >= 0.0) {
             return Err(Error::argument("depth_weight", "must be finite and not negative"));
@@ -226,7 +226,7 @@ impl FitConfig {
         if let Background::Color(color) = self.background
             && !color.iter().all(|c| (0.0..=1.0).contains(c))
         {
-            return Err(Error::argument("background", "must lie in 0..=1"));
+            return Err(Error::argument("background", "must be in 0..=1"));
         }
         Ok(())
     }
@@ -264,7 +264,7 @@ mod tests {
     }
 
     #[test]
-    fn short_fits_are_looked_at_as_often_as_long_ones() {
+    fn short_fits_refine_as_often_as_long_ones() {
         let of = |steps| FitConfig { steps, ..FitConfig::default() };
         let runs: Vec<_> = [1, 900, 3000, 7000].map(|steps| of(steps).refine_steps()).into();
         assert_eq!(runs, [(75, 25), (90, 30), (300, 100), (300, 100)]);

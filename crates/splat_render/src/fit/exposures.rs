@@ -315,7 +315,7 @@ mod tests {
     }
 
     #[test]
-    fn a_photo_that_shows_nothing_keeps_its_start() {
+    fn a_pull_holds_an_exposure_near_its_start() {
         let start =
             |gain: f64| Some(Exposure { gain: [gain; 3], offset: [0.0; 3], background: None });
         let targets = [photo(200), photo(120)];

@@ -101,7 +101,7 @@ impl Fitter {
                 return Err(Error::argument(
                     format!("images[{k}]"),
                     format!(
-                        "is {} x {} where its camera is {} x {}",
+                        "is {} x {}, but its camera is {} x {}",
                         target.width, target.height, camera.width, camera.height
                     ),
                 ));
@@ -114,15 +114,12 @@ impl Fitter {
             return Err(Error::argument("splats", "is empty; a fit starts from at least one"));
         }
         if state.splats.sh_degree != config.sh_degree {
-            return Err(Error::argument(
-                "splats",
-                "do not store the SH degree that is to be fitted",
-            ));
+            return Err(Error::argument("splats", "do not store the SH degree to fit"));
         }
         let has_alpha = targets.iter().map(|t| t.channels == 4).collect();
         let behind = targets.iter().map(|t| t.background).collect();
         if targets.iter().all(|target| target.until.is_some()) {
-            return Err(Error::argument("images", "has none that is fitted to until the end"));
+            return Err(Error::argument("images", "has none that is fitted until the end"));
         }
         let schedule = targets.iter().map(|target| (target.turns, target.until)).collect();
         let longest = targets.iter().map(|t| t.width.max(t.height)).max().unwrap_or(1);

@@ -21,7 +21,7 @@ pub fn splats_from_points(
     if points.len() != colors.len() {
         return Err(Error::argument(
             "colors",
-            format!("has {} rows where points has {}", colors.len(), points.len()),
+            format!("has {} rows, but points has {}", colors.len(), points.len()),
         ));
     }
     // Squared distances of points further out would overflow.

@@ -65,10 +65,10 @@ pub fn plane_sweep(photos: &[GrayPhoto], sweeps: &[Sweep]) -> Result<Vec<DepthMa
     for (k, sweep) in sweeps.iter().enumerate() {
         let bad = |reason: &str| Err(Error::argument(format!("sweeps[{k}]"), reason));
         if sweep.others.iter().chain([&sweep.photo]).any(|&index| index >= photos.len()) {
-            return bad("names a photo that there is not");
+            return bad("names a photo that does not exist");
         }
         if sweep.planes < 2 || !sweep.range.iter().all(|v| v.is_finite() && *v > 0.0) {
-            return bad("needs two planes at least, at finite depths above 0");
+            return bad("needs at least two planes at finite depths above 0");
         }
     }
     Ok(sweeps.par_iter().map(|sweep| dispatch(Sweeping { photos, sweep })).collect())
@@ -414,7 +414,7 @@ mod tests {
     }
 
     #[test]
-    fn says_where_it_knows_nothing() {
+    fn unknown_depths_have_a_low_score() {
         let mut away = photo(0.2, 1.0);
         away.camera.viewmat.w_axis.x = 1e3;
         let mut flat = photo(0.2, 1.0);
@@ -434,7 +434,7 @@ mod tests {
     }
 
     #[test]
-    fn refuses_what_it_cannot_sweep() {
+    fn invalid_photos_are_refused() {
         let photos = [photo(0.0, 1.0)];
         let error =
             |photos: &[GrayPhoto], sweep| plane_sweep(photos, &[sweep]).unwrap_err().to_string();

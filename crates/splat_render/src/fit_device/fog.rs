@@ -122,7 +122,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_far_nearer_than_the_nearest_surface_is_fog() {
+    fn splats_far_nearer_than_the_nearest_surface_are_fog() {
         let splats = wall_and(&[
             ([0.1, 0.0, 1.0], 0.5),
             ([0.1, 0.0, 2.5], 0.5),  // not far nearer
@@ -138,13 +138,13 @@ mod tests {
     }
 
     #[test]
-    fn a_near_surface_is_none() {
+    fn a_near_surface_is_not_fog() {
         let near: Vec<_> = (0..20).map(|k| ([0.05 * k as f32 - 0.5, 0.3, 1.0], 0.05)).collect();
         assert!(fog(&wall_and(&near), &[CAMERA]).is_empty());
     }
 
     #[test]
-    fn what_is_not_finite_is_passed_over() {
+    fn splats_that_are_not_finite_are_skipped() {
         let splats = wall_and(&[
             ([f32::NAN, 0.0, 1.0], 0.5),
             ([0.0, 0.0, f32::INFINITY], 0.5),

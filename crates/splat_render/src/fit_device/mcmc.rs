@@ -245,7 +245,7 @@ mod tests {
     }
 
     #[test]
-    fn the_dead_move_and_the_number_is_met() {
+    fn dead_splats_move_and_the_target_is_reached() {
         let mut state = some(100);
         state.splats.opacities[7] = -20.0;
         state.splats.means[9] = [f32::NAN; 3];
@@ -262,7 +262,7 @@ mod tests {
     }
 
     #[test]
-    fn where_all_are_dead_nothing_moves_and_nothing_grows() {
+    fn dead_scenes_stay_as_they_are() {
         let mut state = some(10);
         state.splats.opacities.fill(-20.0);
         mcmc(&mut state, &run(20));

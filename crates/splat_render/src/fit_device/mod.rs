@@ -128,7 +128,7 @@ impl StepInput {
             return Err(Error::argument(
                 "camera",
                 format!(
-                    "is {} x {} where its photo is {width} x {height}",
+                    "is {} x {}, but its photo is {width} x {height}",
                     self.camera.width, self.camera.height
                 ),
             ));
@@ -142,7 +142,7 @@ impl StepInput {
         if !(0.0..=1.0).contains(&self.ssim_weight) {
             return Err(Error::argument(
                 "ssim_weight",
-                format!("must lie in 0..=1, got {}", self.ssim_weight),
+                format!("must be in 0..=1, got {}", self.ssim_weight),
             ));
         }
         if !(self.depth_weight.is_finite() && self.depth_weight >= 0.0) {

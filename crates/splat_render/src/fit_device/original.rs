@@ -237,7 +237,7 @@ mod tests {
     }
 
     #[test]
-    fn large_ones_split_small_ones_are_cloned_and_faint_ones_go() {
+    fn large_splats_are_split_small_ones_cloned_and_faint_ones_removed() {
         let mut state = some(5);
         state.stats.seen = vec![2.0; 5];
         state.stats.grad_sum = vec![1.0, 1.0, 3e-4, 0.0, 1.0];
@@ -264,7 +264,7 @@ mod tests {
     }
 
     #[test]
-    fn under_the_cap_those_pulled_hardest_grow() {
+    fn under_the_cap_the_largest_gradients_grow() {
         let mut state = some(4);
         state.stats.seen = vec![1.0, 4.0, 0.0, 1.0];
         state.stats.grad_sum = vec![0.5, 4.0, 0.7, f32::NAN];
@@ -278,7 +278,7 @@ mod tests {
     }
 
     #[test]
-    fn huge_ones_go_where_asked_and_a_scene_is_never_emptied() {
+    fn huge_splats_are_removed_on_request_and_a_scene_is_never_emptied() {
         let mut state = some(3);
         state.splats.scales[1][2] = 0.1;
         let huge = OriginalRun { prune_huge: true, ..run(3) };
@@ -296,7 +296,7 @@ mod tests {
     }
 
     #[test]
-    fn whole_numbers_give_the_exponential() {
+    fn exp_is_accurate_to_0_4_percent() {
         for k in -860..=870 {
             let x = 0.1 * k as f32;
             let off = f64::from(exp(x)) / f64::from(x).exp() - 1.0;
@@ -306,7 +306,7 @@ mod tests {
     }
 
     #[test]
-    fn products_and_sums_give_two_over_a_number() {
+    fn two_over_is_accurate() {
         let mut worst = 0.0f64;
         // Every power of two that a squared norm can have, and between them 2000 numbers.
         for power in -40..126 {
@@ -339,7 +339,7 @@ mod tests {
     }
 
     #[test]
-    fn halves_lie_as_the_splat_does() {
+    fn halves_are_placed_along_the_splat() {
         let mut splats = SplatArrays::zeros(1, 0);
         splats.means[0] = [1.0, 2.0, 3.0];
         // A quarter turn about z brings the long axis x to y.

@@ -64,7 +64,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn dropout_leaves_out_its_part_and_other_splats_each_step() {
+    fn dropout_leaves_out_other_splats_at_each_step() {
         let dropped = |seed, rate| (0..100_000).filter(move |&i| is_dropped(seed, i, rate));
         assert_eq!(dropped(3, 0.0).count(), 0);
         for (seed, rate) in [(0, 0.1), (7, 0.3), (u32::MAX, 0.9)] {

@@ -102,7 +102,7 @@ impl FitState {
         if self.frozen > 0 && self.frozen >= n {
             return Err(Error::argument(
                 "frozen_splats",
-                format!("must be fewer than the {n} splats there are, got {}", self.frozen),
+                format!("must be fewer than the {n} splats, got {}", self.frozen),
             ));
         }
         Ok(())

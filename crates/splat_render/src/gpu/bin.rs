@@ -293,7 +293,7 @@ impl SplatBins {
                 return Err(Error::argument(
                     "means",
                     format!(
-                        "{} splats lie in one 16x16 tile, the device takes {limit}; use fewer \
+                        "{} splats are in one 16x16 tile, but the device takes {limit}; use fewer \
                          splats or backend cpu",
                         count.total
                     ),

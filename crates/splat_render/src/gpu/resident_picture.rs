@@ -64,8 +64,7 @@ impl ResidentPicture {
             return Err(Error::argument(
                 "columns",
                 format!(
-                    "{columns:?} of a picture of {}x{} are none or more than there is room for, \
-                     {}x{}",
+                    "{columns:?} of a picture of {}x{} are empty or larger than the room for {}x{}",
                     camera.width, camera.height, self.width, self.height
                 ),
             ));

@@ -323,7 +323,7 @@ mod tests {
     }
 
     #[test]
-    fn the_scene_has_all_that_a_picture_may_have() {
+    fn the_scene_covers_all_cases() {
         let outputs = all_stages::<f64>(&Reference).unwrap();
         let of = |stage: &str, k: usize| {
             &outputs.iter().filter(|(name, _)| *name == stage).nth(k).unwrap().1

@@ -47,7 +47,10 @@ fn columns<const N: usize>(
     let mut offsets = [0; N];
     for (offset, name) in offsets.iter_mut().zip(names) {
         *offset = element.offset(name, kind).ok_or_else(|| {
-            named.bad(format!("has no '{name}' in its {}s; it is no compressed .ply", element.name))
+            named.bad(format!(
+                "has no '{name}' in its {}s; it is not a compressed .ply",
+                element.name
+            ))
         })?;
     }
     Ok(offsets)
@@ -64,12 +67,12 @@ pub fn read(
         [chunk, vertex, ..] if vertex.name == "vertex" => (chunk, vertex),
         _ => {
             return Err(
-                named.bad("has chunks but no vertices after them; it is no compressed .ply")
+                named.bad("has chunks but no vertices after them; it is not a compressed .ply")
             );
         }
     };
     if header.elements.iter().any(|element| element.lists) {
-        return Err(named.bad("holds lists, which no compressed .ply has"));
+        return Err(named.bad("holds lists, which a compressed .ply cannot have"));
     }
     let sh = header.elements.get(2).filter(|element| element.name == "sh");
     let wanted =
@@ -83,7 +86,7 @@ pub fn read(
     limits::check_file_size(named, size)?;
     if chunk.count != vertex.count.div_ceil(CHUNK as u64) {
         return Err(named.bad(format!(
-            "has {} chunks for {} splats, where each chunk is of {CHUNK}; it is damaged",
+            "has {} chunks for {} splats, but a chunk has {CHUNK}; it is damaged",
             chunk.count, vertex.count
         )));
     }
@@ -151,13 +154,13 @@ fn rest_columns(sh: &Element, count: u64, named: &Named<'_>) -> Result<(u32, Vec
     }
     let rest = sh.properties.len();
     let degree = (1..=SH_DEGREE).find(|&d| 3 * (sh::coeffs(d) - 1) == rest).ok_or_else(|| {
-        named.bad(format!("has {rest} f_rest properties, which is no SH degree in 1..=3"))
+        named.bad(format!("has {rest} f_rest properties, which match no SH degree in 1..=3"))
     })?;
     let offsets = (0..rest)
         .map(|k| {
             let name = format!("f_rest_{k}");
             sh.offset(&name, Kind::Uchar).ok_or_else(|| {
-                named.bad(format!("has no byte property '{name}'; it is no compressed .ply"))
+                named.bad(format!("has no byte property '{name}'; it is not a compressed .ply"))
             })
         })
         .collect::<Result<_>>()?;

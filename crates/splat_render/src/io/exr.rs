@@ -43,7 +43,7 @@ pub fn encode_exr(picture: &ExrPicture<'_>) -> Result<Vec<u8>> {
         if length != pixels {
             return Err(Error::argument(
                 name,
-                format!("has {length} pixels where the picture has {width} x {height}"),
+                format!("has {length} pixels, but the picture has {width} x {height}"),
             ));
         }
     }

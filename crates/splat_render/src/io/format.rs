@@ -90,12 +90,12 @@ impl Format {
             // Continue, so that the error names the expected start of the file.
             (None, Some(Self::Ply | Self::CompressedPly)) => Ok(Self::Ply),
             (None, Some(format)) => Err(named.bad(format!(
-                "does not start as a .{} file does; it is damaged or of another kind: give a file \
+                "does not start like a .{} file; it is damaged or of another format: give a file \
                  of splats",
                 format.name()
             ))),
             (None, None) => Err(named.bad(
-                "is no file of splats that can be read: .ply, .splat, .ksplat, .spz, .sog, .glb \
+                "is not a readable file of splats: .ply, .splat, .ksplat, .spz, .sog, .glb \
                  or .gltf",
             )),
         }
@@ -110,6 +110,6 @@ impl Format {
     }
 
     pub(super) fn unwritable(path: &Path) -> Error {
-        Error::file(path, format!("has no ending that can be written; end it in {WRITABLE}"))
+        Error::file(path, format!("has an ending that cannot be written; use {WRITABLE}"))
     }
 }

@@ -65,7 +65,7 @@ pub fn parse(bytes: &[u8], named: &Named<'_>) -> Result<Loaded> {
     }
     let level_number = u16_at(header, 20);
     let level = LEVELS.get(usize::from(level_number)).ok_or_else(|| {
-        named.bad(format!("has the compression level {level_number}, where 0 to 2 are known"))
+        named.bad(format!("has the compression level {level_number}, but only 0 to 2 are known"))
     })?;
     let range = |at: usize, default: f32| match f32_at(header, at) {
         0.0 => default,
@@ -108,11 +108,11 @@ impl<'a> Section<'a> {
         let (full_buckets, partial) = (u32_at(header, 32) as usize, u32_at(header, 36) as usize);
         let degree = u32::from(u16_at(header, 40));
         if degree > SH_DEGREE {
-            return Err(named.bad(format!("has SH degree {degree}, where a .ksplat has 0 to 2")));
+            return Err(named.bad(format!("has SH degree {degree}, but a .ksplat has 0 to 2")));
         }
         if count > reserved {
             return Err(
-                named.bad(format!("has {count} splats where {reserved} fit; it is damaged"))
+                named.bad(format!("has {count} splats, but only {reserved} fit; it is damaged"))
             );
         }
         let bucket_stride = usize::from(u16_at(header, 20));
@@ -138,7 +138,7 @@ impl<'a> Section<'a> {
             steps,
         };
         if level.scale != LEVELS[0].scale && !section.buckets_cover(bucket_count) {
-            return Err(named.bad("has splats that are in none of its buckets; it is damaged"));
+            return Err(named.bad("has splats outside of its buckets; it is damaged"));
         }
         Ok(section)
     }

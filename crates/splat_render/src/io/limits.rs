@@ -17,7 +17,7 @@ const UNPACKED_FREE: u64 = 64 << 20;
 pub fn check_file_size(named: &Named<'_>, size: u64) -> Result<()> {
     if size > FILE_MAX {
         return Err(named.bad(format!(
-            "is {size} bytes, more than the {FILE_MAX} that are read at once; split the scene or \
+            "is {size} bytes, more than the limit of {FILE_MAX}; split the scene or \
              convert it to .ply with the program that wrote it"
         )));
     }

@@ -57,7 +57,7 @@ pub fn read_splats(path: &Path) -> Result<Loaded> {
     }
     if path.file_name().is_some_and(|name| name == STREAMED) {
         return Err(named.bad(
-            "is a scene in levels of detail; look at it with splat-view or igsr view, or give the \
+            "is a scene in levels of detail; open it with splat-view or igsr view, or give the \
              meta.json of one of its folders",
         ));
     }
@@ -126,18 +126,4 @@ pub fn write_splats(path: &Path, file: &SplatFile) -> Result<Vec<String>> {
     };
     write_atomically(path, |out| out.write_all(&bytes))?;
     Ok(notes)
-}
-
-/// Reads a `.ply`, INRIA's or compressed, whatever its ending.
-pub fn read_ply(path: &Path) -> Result<SplatFile> {
-    let named = Named(path);
-    let file = open_file(path)?;
-    let size = file.metadata().map_err(|e| named.bad(format!("cannot be read ({e})")))?.len();
-    Ok(read_any_ply(&mut BufReader::new(file), size, &named)?.file)
-}
-
-/// Writes INRIA's `.ply`, whatever the path's ending.
-pub fn write_ply(path: &Path, file: &SplatFile) -> Result<()> {
-    file.splats.validate()?;
-    write_atomically(path, |out| ply::write(out, file))
 }

@@ -13,7 +13,9 @@ pub fn open_file(path: &Path) -> Result<File> {
     let closed = |e: std::io::Error| named.bad(format!("cannot be opened ({e})"));
     let kind = std::fs::metadata(path).map_err(closed)?;
     if !kind.is_file() && !kind.is_dir() {
-        return Err(named.bad("is a pipe or a device; save what it gives to a file, and name that"));
+        return Err(
+            named.bad("is a pipe or a device; save its output to a file, and name that file")
+        );
     }
     File::open(path).map_err(closed)
 }

@@ -32,7 +32,7 @@ impl Rows {
     pub fn new(header: &Header, size: u64, named: &Named<'_>) -> Result<Self> {
         let vertex = &header.elements[0];
         if vertex.name != "vertex" {
-            return Err(named.bad(format!("starts with '{}' where 'vertex' belongs", vertex.name)));
+            return Err(named.bad(format!("starts with '{}' instead of 'vertex'", vertex.name)));
         }
         if vertex.lists {
             return Err(named.bad("holds lists in its vertices; it is a mesh, not splats"));
@@ -60,7 +60,7 @@ impl Rows {
             .find(|&d| 3 * (sh::coeffs(d) - 1) == rest_count)
             .ok_or_else(|| {
                 named.bad(format!(
-                    "has {rest_count} f_rest properties, which is no SH degree in 0..=4"
+                    "has {rest_count} f_rest properties, which match no SH degree in 0..=4"
                 ))
             })?;
         let rest: Vec<usize> =

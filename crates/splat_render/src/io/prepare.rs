@@ -27,7 +27,7 @@ pub fn prepare<'a>(
     let left_out = splats.len() - drawn.len();
     if left_out > 0 {
         notes.push(format!(
-            "{} that no renderer draws (not finite, or without a rotation) {} left out.",
+            "{} that cannot be drawn (not finite, or without a rotation) {} left out.",
             counted(left_out),
             if left_out == 1 { "is" } else { "are" }
         ));
@@ -36,7 +36,7 @@ pub fn prepare<'a>(
     if splats.sh_degree > room.sh_degree {
         notes.push(if room.sh_degree == 0 {
             format!(
-                "A {} holds no view-dependent color: the spherical harmonics of degree 1 to {} \
+                "A {} has no view-dependent color: the spherical harmonics of degree 1 to {} \
                  are dropped.",
                 room.name, splats.sh_degree
             )
@@ -63,7 +63,7 @@ pub fn prepare<'a>(
     }
     if !room.antialiased && file.antialiased {
         notes.push(format!(
-            "A {} cannot say that the splats are antialiased: choose that in the viewer.",
+            "A {} cannot store that the splats are antialiased: choose this in the viewer.",
             room.name
         ));
     }
@@ -108,5 +108,5 @@ pub fn cut_degree(splats: &SplatArrays, degree: u32) -> SplatArrays {
 
 /// The error of splats that a format has no way to hold.
 pub fn unfit(what: &str) -> Error {
-    Error::argument("splats", format!("{what}; write a .ply, which has no such limit"))
+    Error::argument("splats", format!("{what}; write a .ply, which has no limit"))
 }

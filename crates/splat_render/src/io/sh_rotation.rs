@@ -94,7 +94,7 @@ mod tests {
     use glam::{DQuat, DVec3};
 
     #[test]
-    fn a_turned_scene_shows_each_direction_what_it_showed_before() {
+    fn a_turned_scene_keeps_its_colors_in_each_direction() {
         let turn = DQuat::from_axis_angle(DVec3::new(0.3, -0.5, 0.8).normalize(), 1.1);
         let rotation = ShRotation::new(|d| (turn.inverse() * DVec3::from_array(d)).to_array());
         let before: Vec<[f32; 3]> =

@@ -16,7 +16,7 @@ pub fn parse(bytes: &[u8], named: &Named<'_>) -> Result<Loaded> {
     let (rows, rest) = bytes.as_chunks::<ROW>();
     if !rest.is_empty() {
         return Err(named.bad(format!(
-            "is {} bytes, no multiple of the {ROW} of a splat; it is truncated or no .splat",
+            "is {} bytes, not a multiple of the {ROW} of a splat; it is truncated or not a .splat",
             bytes.len()
         )));
     }
@@ -48,7 +48,7 @@ pub fn linear_scale(log: f32) -> f32 {
 pub fn encode(file: &SplatFile, notes: &mut Vec<String>) -> Result<Vec<u8>> {
     let splats = prepare(file, &ROOM, notes);
     if splats.is_empty() {
-        return Err(unfit("none are left to write, and a .splat of none would be an empty file"));
+        return Err(unfit("no splats are left to write, and the .splat would be an empty file"));
     }
     let mut out = Vec::with_capacity(ROW * splats.len());
     let mut clipped = 0;

@@ -61,7 +61,7 @@ struct Header {
 impl Header {
     fn read(header: &[u8], size: usize, named: &Named<'_>) -> Result<Self> {
         if !header.starts_with(MAGIC) {
-            return Err(named.bad("is compressed but no .spz; give a file of splats"));
+            return Err(named.bad("is compressed but not a .spz; give a file of splats"));
         }
         let (version, degree, fraction_bits) = (u32_at(header, 4), header[12], header[13]);
         if !(2..=4).contains(&version) {
@@ -70,11 +70,11 @@ impl Header {
             )));
         }
         if u32::from(degree) > SH_DEGREE_MAX {
-            return Err(named.bad(format!("has SH degree {degree}, where 0 to 4 are known")));
+            return Err(named.bad(format!("has SH degree {degree}, but only 0 to 4 are known")));
         }
         if fraction_bits > FRACTION_BITS_MAX {
             return Err(named.bad(format!(
-                "has positions of {fraction_bits} fractional bits, where 24 bits are all; it is \
+                "has positions of {fraction_bits} fractional bits, but only 24 bits; it is \
                  damaged"
             )));
         }
@@ -100,7 +100,7 @@ pub fn parse(bytes: &[u8], named: &Named<'_>) -> Result<Loaded> {
     }
     let mut notes = Vec::new();
     if header.flags & FLAG_EXTENSIONS != 0 {
-        notes.push("Extensions of the .spz are passed over.".to_owned());
+        notes.push("Extensions of the .spz are ignored.".to_owned());
     }
     let splats = unpack(&header, arrays);
     let antialiased = header.flags & FLAG_ANTIALIASED != 0;
@@ -116,7 +116,7 @@ fn open_gzip(bytes: &[u8], named: &Named<'_>) -> Result<(Header, Vec<u8>)> {
     gzip.read_exact(&mut header).map_err(damaged)?;
     let header = Header::read(&header, bytes.len(), named)?;
     if header.version == 4 {
-        return Err(named.bad("is of version 4 but compressed as version 3 is; it is damaged"));
+        return Err(named.bad("is of version 4 but compressed as version 3; it is damaged"));
     }
     let wanted = header.sizes().iter().sum::<usize>();
     let mut data = Vec::new();
@@ -157,7 +157,7 @@ fn open_4(bytes: &[u8], named: &Named<'_>) -> Result<(Header, Vec<u8>)> {
     let sizes: Vec<usize> = header.sizes().into_iter().filter(|&size| size > 0).collect();
     if usize::from(head[15]) != sizes.len() {
         return Err(named.bad(format!(
-            "has {} streams where {} splats of SH degree {} take {}; it is damaged",
+            "has {} streams, but {} splats of SH degree {} take {}; it is damaged",
             head[15],
             header.count,
             header.degree,
@@ -172,7 +172,7 @@ fn open_4(bytes: &[u8], named: &Named<'_>) -> Result<(Header, Vec<u8>)> {
         let (compressed, unpacked) = (u64_at(row, 0), u64_at(row, 8));
         if unpacked != size as u64 {
             return Err(named.bad(format!(
-                "has a stream of {unpacked} bytes where {size} belong; it is damaged"
+                "has a stream of {unpacked} bytes instead of {size}; it is damaged"
             )));
         }
         let compressed = usize::try_from(compressed).unwrap_or(usize::MAX);
@@ -267,7 +267,7 @@ fn fraction_bits(splats: &SplatArrays) -> Result<u8> {
 pub fn encode(file: &SplatFile, notes: &mut Vec<String>) -> Result<Vec<u8>> {
     let splats = prepare(file, &ROOM, notes);
     let (n, stride) = (splats.len(), splats.stride());
-    let count = u32::try_from(n).map_err(|_| unfit("a .spz holds 2^32 splats"))?;
+    let count = u32::try_from(n).map_err(|_| unfit("a .spz holds at most 2^32 splats"))?;
     let bits = fraction_bits(&splats)?;
     if splats.sh_degree == SH_DEGREE_MAX {
         notes.push("Readers of .spz before 2026 know no SH of degree 4.".to_owned());

@@ -91,7 +91,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn cells_hold_about_equally_many_and_a_point_is_in_one() {
+    fn cells_are_balanced_and_each_point_is_in_one() {
         let mut points: Vec<[f32; 3]> = (0..1000u32)
             .map(|i| [0, 1, 2].map(|k| ((i * [7, 11, 13][k]) % 101) as f32 * [1.0, 3.0, 0.1][k]))
             .collect();

@@ -214,7 +214,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_out_of_the_picture_stays_coarse_and_is_bounded() {
+    fn cells_outside_of_the_picture_stay_coarse() {
         let choice = choose(&row(), &view(1005.2, 0.0), 5000);
         assert_eq!(choice.levels[..4], [Some(2); 4]);
         assert_eq!(choice.levels[6..], [Some(0); 4]);
@@ -223,7 +223,7 @@ mod tests {
     }
 
     #[test]
-    fn from_afar_nothing_finer_is_chosen_than_can_be_seen() {
+    fn levels_are_no_finer_than_visible() {
         let manifest = row();
         let far = choose(&manifest, &view(700.0, 1.0), 5000);
         assert_eq!(far.levels, vec![Some(2); 10]);

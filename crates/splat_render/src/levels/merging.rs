@@ -15,13 +15,13 @@ use super::symmetric::axes;
 use crate::splats::SplatArrays;
 
 /// Maximum opacity of a merged splat: a logit of 1 is infinite.
-const MOST_OPAQUE: f64 = 0.995;
+const OPACITY_MAX: f64 = 0.995;
 /// Cost of a color difference, relative to a distance of the root of both spreads.
 const COLOR: f64 = 4.0;
 /// The lowest coefficient of degree 0 that differs from black: color = 0.5 + coefficient / (2 sqrt(pi)).
 const BLACK: f32 = -1.772_453_9;
 /// Nothing weighs less than this.
-const LEAST: f64 = 1e-30;
+const TINY: f64 = 1e-30;
 
 /// The splats of a level.
 pub struct Merged {
@@ -96,7 +96,7 @@ impl Merging {
             let rotation = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());
             let along = rotation * DMat3::from_diagonal(scales);
             Cluster {
-                weight: (opacity * area(scales)).max(LEAST),
+                weight: (opacity * area(scales)).max(TINY),
                 mean: DVec3::from(splats.means[i].map(f64::from)),
                 spread: along * along.transpose(),
                 members: 1,
@@ -199,8 +199,8 @@ impl Merging {
                 continue;
             }
             let (squares, turned) = axes(cluster.spread.to_cols_array_2d());
-            let sizes = DVec3::from(squares.map(|s| s.max(LEAST).sqrt()));
-            let opaque = (cluster.weight / area(sizes)).clamp(1e-4, MOST_OPAQUE);
+            let sizes = DVec3::from(squares.map(|s| s.max(TINY).sqrt()));
+            let opaque = (cluster.weight / area(sizes)).clamp(1e-4, OPACITY_MAX);
             // `turned` has the axes as columns, in rows.
             let turn = DQuat::from_mat3(&DMat3::from_cols_array_2d(&turned).transpose());
             out.means[at] = cluster.mean.as_vec3().to_array();
@@ -211,7 +211,7 @@ impl Merging {
                 .copy_from_slice(&self.sh[i * self.stride..(i + 1) * self.stride]);
         }
         let total: f64 = ids.iter().map(|&i| self.clusters[i].weight).sum();
-        Merged { splats: out, moved: (self.moves / total.max(LEAST)).sqrt() }
+        Merged { splats: out, moved: (self.moves / total.max(TINY)).sqrt() }
     }
 }
 

@@ -42,7 +42,7 @@ impl Resident {
             if file.splats.len() >= budget {
                 let n = file.splats.len();
                 let what =
-                    format!("of {budget} splats has no room beside the {n} that are always drawn");
+                    format!("of {budget} splats is no more than the {n} that are always drawn");
                 return Err(Error::argument("budget", format!("{what}; give more")));
             }
             out.environment = file.splats;
@@ -141,7 +141,7 @@ fn read_file(manifest: &Manifest, file: usize) -> Result<SplatFile> {
     let mut read = read_splats(&path)?.file;
     let (there, said) = (read.splats.len(), manifest.size_of(file));
     if there != said {
-        let what = format!("holds {there} splats where {} says {said}", super::INDEX);
+        let what = format!("holds {there} splats, but {} says {said}", super::INDEX);
         return Err(Error::file(&path, format!("{what}; write the levels again")));
     }
     // Cells keep their rows: invalid splats become faint and tiny instead of being removed.

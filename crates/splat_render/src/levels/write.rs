@@ -128,10 +128,10 @@ pub fn write_levels(
     std::fs::write(&path, written(&manifest, &tree, &cells)).map_err(|e| unwritable(&path, &e))?;
     let mut notes = Vec::new();
     if left_out > 0 {
-        notes.push(format!("{left_out} splats that no renderer draws are left out."));
+        notes.push(format!("{left_out} splats that cannot be drawn are left out."));
     }
     if rows.sh_degree > DEGREE {
-        notes.push(format!("SOG holds spherical harmonics up to degree {DEGREE}."));
+        notes.push(format!("SOG has spherical harmonics up to degree {DEGREE}."));
     }
     Ok(Some(LevelsWritten {
         counts: manifest.counts(),

@@ -83,7 +83,7 @@ pub trait Stages<T: Float> {
     ) -> Result<ExposureGradients<T>> {
         check_exposure(image, exposure)?;
         let lengths = [("v_corrected", v_corrected.len())];
-        check_lengths(&lengths, image.color.len(), "pixels where the picture has")?;
+        check_lengths(&lengths, image.color.len(), "pixels, but the picture has")?;
         self.exposure_backward_unchecked(image, exposure, v_corrected)
     }
 
@@ -104,17 +104,17 @@ pub trait Stages<T: Float> {
             return Err(Error::argument(
                 "image",
                 format!(
-                    "is {} x {} where the photo is {width} x {height}",
+                    "is {} x {}, but the photo is {width} x {height}",
                     image.width, image.height
                 ),
             ));
         }
         let pixels = width as usize * height as usize;
-        check_lengths(&[("image", image.color.len())], pixels, "pixels where the photo has")?;
+        check_lengths(&[("image", image.color.len())], pixels, "pixels, but the photo has")?;
         if !(0.0..=1.0).contains(&ssim_weight) {
             return Err(Error::argument(
                 "ssim_weight",
-                format!("must lie in 0..=1, got {ssim_weight}"),
+                format!("must be in 0..=1, got {ssim_weight}"),
             ));
         }
         self.loss_unchecked(image, target, background, ssim_weight)
@@ -135,7 +135,7 @@ pub trait Stages<T: Float> {
             ("image", image.depth.len()),
             ("image", image.transmittance.len()),
         ];
-        check_lengths(&lengths, pixels, "pixels where its size asks for")?;
+        check_lengths(&lengths, pixels, "pixels, but its size requires")?;
         self.depth_loss_unchecked(image, target)
     }
 
@@ -222,5 +222,5 @@ fn check_exposure<T: Float>(image: &Image<T>, exposure: &Exposure<T>) -> Result<
     check_size(image.width, image.height)?;
     let pixels = image.width as usize * image.height as usize;
     let lengths = [("image", image.color.len()), ("image", image.transmittance.len())];
-    check_lengths(&lengths, pixels, "pixels where its size asks for")
+    check_lengths(&lengths, pixels, "pixels, but its size requires")
 }

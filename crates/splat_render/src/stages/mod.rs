@@ -126,7 +126,7 @@ impl<T> Projected<T> {
             ("opacities", self.opacities.len()),
             ("radii", self.radii.len()),
         ];
-        check_lengths(&lengths, self.len(), "rows where means2d has")
+        check_lengths(&lengths, self.len(), "rows, but means2d has")
     }
 
     /// Number of splats, culled ones included.
@@ -189,7 +189,7 @@ impl<T> ImageGradients<T> {
             return Err(Error::argument(
                 "image",
                 format!(
-                    "is {} x {} where the picture is {} x {}",
+                    "is {} x {}, but the picture is {} x {}",
                     image.width, image.height, size.0, size.1
                 ),
             ));
@@ -204,7 +204,7 @@ impl<T> ImageGradients<T> {
             ("v_depth", self.v_depth.len()),
         ];
         let pixels = projected.width as usize * projected.height as usize;
-        check_lengths(&lengths, pixels, "pixels where the picture has")
+        check_lengths(&lengths, pixels, "pixels, but the picture has")
     }
 }
 
@@ -239,7 +239,7 @@ impl<T> ProjectedGradients<T> {
             ("v_colors", self.v_colors.len()),
             ("v_opacities", self.v_opacities.len()),
         ];
-        check_lengths(&lengths, splats, "rows where means has")
+        check_lengths(&lengths, splats, "rows, but means has")
     }
 }
 
@@ -395,11 +395,11 @@ impl<T> AdamState<T> {
             ("v_scales", gradients.v_scales.len()),
             ("v_opacities", gradients.v_opacities.len()),
         ];
-        check_lengths(&lengths, n, "rows where means has")?;
+        check_lengths(&lengths, n, "rows, but means has")?;
         check_lengths(
             &[("v_colors", gradients.v_colors.len())],
             self.splats.sh.len(),
-            "rows where sh has",
+            "rows, but sh has",
         )
     }
 }

@@ -1,5 +1,4 @@
-//! Where implementations once differed: splats behind the camera, 2D splats that no stage made, and
-//! options that make no sense.
+//! Regression checks: splats behind the camera, invalid 2D splats, and invalid options.
 
 use splat_render::constants::{BLUR, FAR, NEAR};
 use splat_render::fit::{FitDevice, FitState, Rates, StepInput, Target};
@@ -41,7 +40,7 @@ pub fn invalid_2d_splats_are_not_drawn(stages: &dyn Stages<f32>) {
     }
 }
 
-/// A near plane of 0 draws what lies before the camera, and only that.
+/// A near plane of 0 draws splats in front of the camera, and no others.
 pub fn a_near_plane_of_zero_draws_what_is_before_the_camera(stages: &dyn Stages<f32>) {
     let mut rng = rng(92);
     let mut scene = random_scene(&mut rng, 6, Some(1));
@@ -66,7 +65,7 @@ fn named<T>(result: splat_render::Result<T>) -> String {
 }
 
 /// Settings and sizes that make no sense are refused by every stage that takes them.
-pub fn senseless_options_are_refused(stages: &dyn Stages<f32>) {
+pub fn invalid_options_are_refused(stages: &dyn Stages<f32>) {
     let mut rng = rng(93);
     let scene = random_scene(&mut rng, 5, Some(1));
     let camera = random_camera(&mut rng, 20, 10);
@@ -163,8 +162,8 @@ fn fitted(device: &mut dyn FitDevice) -> (FitState, StepInput) {
     (state, input)
 }
 
-/// With all rates 0 a step moves no parameter and no moment; its loss, its statistics and its camera's
-/// gradient are those of a step that moves. Coefficients that are not in use rest in any step.
+/// With all rates 0, a step changes no parameter and no moment; loss, statistics and the camera's
+/// gradient are unaffected. Unused coefficients do not change in any step.
 pub fn frozen_steps_keep_the_moments(device: &mut dyn FitDevice) {
     let (before, input) = fitted(device);
     device.step(&StepInput { rates: Rates::ZERO, ..input }).unwrap();
@@ -188,8 +187,7 @@ pub fn frozen_steps_keep_the_moments(device: &mut dyn FitDevice) {
     }
 }
 
-/// The last splats of a state are drawn and never changed; the others take the step that they take
-/// where all move, and so do loss and camera.
+/// The last splats of a state are drawn and never changed; the rest, loss and camera are unaffected.
 pub fn the_last_splats_stay(device: &mut dyn FitDevice) {
     let (before, input) = fitted(device);
     // The regularizers are means over the splats that move.
@@ -222,7 +220,7 @@ pub fn the_last_splats_stay(device: &mut dyn FitDevice) {
 }
 
 /// Steps that make no sense are refused by every device, and change nothing.
-pub fn senseless_steps_are_refused(device: &mut dyn FitDevice) {
+pub fn invalid_steps_are_refused(device: &mut dyn FitDevice) {
     let (before, input) = fitted(device);
     let turned = Camera { width: 30, height: 40, ..input.camera };
     let nowhere = Camera { fx: f64::NAN, ..input.camera };

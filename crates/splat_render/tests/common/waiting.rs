@@ -1,4 +1,4 @@
-//! Colors of splats that a step does not see take its update later; no bit may tell.
+//! Delayed color updates of unseen splats change no bit.
 
 use splat_render::fit::{COLOR_WAIT, FitDevice, FitState, McmcRun, OriginalRun, Rates, StepInput};
 
@@ -12,8 +12,8 @@ const GROWS: [u32; 2] = [20, STEPS - 50];
 const FROZEN: [u32; 3] = [3, 200, STEPS - 20];
 const _: () = assert!(FROZEN[1] - GROWS[0] > COLOR_WAIT as u32 + 1);
 
-/// Cameras that see a part of the scene each, and a state amid a fit, so that what no camera sees drifts.
-/// Some moments are zero, some splats are only drawn.
+/// Cameras that see a part of the scene each, and a state in the middle of a fit, so that unseen splats
+/// drift. Some moments are zero, some splats are frozen.
 fn begin(device: &mut dyn FitDevice, seed: u64) -> (Vec<Camera>, FitState) {
     let mut rng = rng(seed);
     let (adam, _) = random_adam(&mut rng, 300, 3);
@@ -87,7 +87,7 @@ fn end(device: &mut dyn FitDevice, control: &[u32], resume: &[u32], frozen: usiz
     device.download().unwrap()
 }
 
-/// `device` makes a device whose colors wait for so many steps at most.
+/// `device` makes a device whose colors wait for at most this many steps.
 pub fn waiting_colors_end_with_the_same_bits<D: FitDevice>(device: impl Fn(usize) -> D) {
     let (cameras, before) = begin(&mut device(COLOR_WAIT), 31);
     let mut first = device(COLOR_WAIT);

@@ -5,6 +5,7 @@
 #[cfg(target_os = "linux")]
 pub mod dragging;
 
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -13,6 +14,7 @@ use glam::{DMat4, DVec3};
 use splat_render::Camera;
 use splat_render::fit::SplatArrays;
 use splat_render::io::{SplatFile, write_splats};
+use splat_render::levels::write_levels;
 
 /// A new folder, deleted on drop.
 pub struct Folder(pub PathBuf);
@@ -79,6 +81,68 @@ pub fn ball(count: usize, seed: u64, tint: [f32; 3]) -> SplatFile {
 pub fn write(path: &Path, file: &SplatFile) {
     std::fs::create_dir_all(path.parent().expect("a folder")).expect("folder");
     write_splats(path, file).expect("a splat file");
+}
+
+/// A ply in a new folder.
+pub fn saved(file: &SplatFile) -> (Folder, PathBuf) {
+    let folder = Folder::new();
+    let scene = folder.join("scene.ply");
+    write(&scene, file);
+    (folder, scene)
+}
+
+/// Writes a scene to the folder, and its levels of detail to the folder's `levels`.
+pub fn write_in_levels(folder: &Folder, file: &SplatFile) -> PathBuf {
+    let (scene, levels) = (folder.join("scene.ply"), folder.join("levels"));
+    write(&scene, file);
+    std::fs::create_dir(&levels).expect("a folder");
+    write_levels(&scene, &levels, 3, 200, &mut || true).expect("levels");
+    levels
+}
+
+/// A checkpoint as numpy's savez writes it.
+pub fn write_checkpoint(path: &Path, file: &SplatFile) {
+    let mut zip = zip::ZipWriter::new(std::fs::File::create(path).expect("file"));
+    let stored =
+        zip::write::SimpleFileOptions::default().compression_method(zip::CompressionMethod::Stored);
+    let mut member = |name: &str, kind: &str, shape: &str, data: Vec<u8>| {
+        let mut header =
+            format!("{{'descr': '{kind}', 'fortran_order': False, 'shape': ({shape}), }}");
+        while !(header.len() + 11).is_multiple_of(64) {
+            header.push(' ');
+        }
+        header.push('\n');
+        zip.start_file(format!("{name}.npy"), stored).expect("member");
+        zip.write_all(b"\x93NUMPY\x01\x00").expect("write");
+        zip.write_all(&(header.len() as u16).to_le_bytes()).expect("write");
+        zip.write_all(header.as_bytes()).expect("write");
+        zip.write_all(&data).expect("write");
+    };
+    let floats = |values: &[f32]| values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>();
+    let (s, n) = (&file.splats, file.splats.len());
+    member("means", "<f4", &format!("{n}, 3"), floats(s.means.as_flattened()));
+    member("quats", "<f4", &format!("{n}, 4"), floats(s.quats.as_flattened()));
+    member("scales", "<f4", &format!("{n}, 3"), floats(s.scales.as_flattened()));
+    member("opacities", "<f4", &format!("{n},"), floats(&s.opacities));
+    member("sh", "<f4", &format!("{n}, {}, 3", s.stride()), floats(s.sh.as_flattened()));
+    let origin = file.origin.iter().flat_map(|v| v.to_le_bytes()).collect();
+    member("origin", "<f8", "3,", origin);
+    zip.finish().expect("zip");
+}
+
+/// A camera 4 units off, with its middle elsewhere than the picture's.
+pub fn camera() -> Camera {
+    Camera {
+        viewmat: DMat4::from_translation(DVec3::new(0.1, -0.2, 4.0))
+            * DMat4::from_rotation_y(0.6)
+            * DMat4::from_rotation_x(0.3),
+        fx: 110.0,
+        fy: 100.0,
+        cx: 60.0,
+        cy: 35.0,
+        width: 120,
+        height: 80,
+    }
 }
 
 /// A file of cameras in igsr's format, with missing photos.

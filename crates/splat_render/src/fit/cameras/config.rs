@@ -50,10 +50,10 @@ impl CameraConfig {
             return Err(Error::argument("camera_rate", "must be finite and not negative"));
         }
         if !(self.decay > 0.0 && self.decay <= 1.0) {
-            return Err(Error::argument("camera_decay", "must lie above 0 and at most at 1"));
+            return Err(Error::argument("camera_decay", "must be above 0 and at most 1"));
         }
         if !(0.0..=1.0).contains(&self.warm_up) {
-            return Err(Error::argument("camera_warm_up", "must lie in 0..=1"));
+            return Err(Error::argument("camera_warm_up", "must be in 0..=1"));
         }
         Ok(())
     }

@@ -187,7 +187,7 @@ fn cameras_at_one_place_keep_the_scale_of_their_moves() {
 }
 
 #[test]
-fn cameras_with_priors_stay_within_what_is_known_and_move_along_what_is_not() {
+fn cameras_with_priors_move_along_unknown_directions() {
     let truth = ring(4);
     let off = CameraConfig { anchored: false, focal: Focal::PerCamera, ..config() };
     let mut told = truth.clone();
@@ -229,7 +229,7 @@ fn cameras_with_priors_stay_within_what_is_known_and_move_along_what_is_not() {
 }
 
 #[test]
-fn priors_that_know_nothing_change_no_bit_and_wrong_ones_are_refused() {
+fn empty_priors_change_no_bit_and_wrong_ones_are_refused() {
     let truth = ring(3);
     let mut noisy = truth.clone();
     move_by(&mut noisy[1], [0.01; 6]);
@@ -323,7 +323,7 @@ fn rigs_find_the_points_and_keep_their_shape() {
 }
 
 #[test]
-fn a_prior_of_one_camera_holds_its_rig() {
+fn a_prior_of_one_camera_keeps_its_rig_in_place() {
     let (told, numbers) = rigs(3);
     let pushed: Vec<_> = told
         .iter()

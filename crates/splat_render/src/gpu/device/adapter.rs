@@ -74,11 +74,11 @@ impl Gpu {
         let Some(adapter) = adapters.first() else {
             return Err(Error::NoAdapter(
                 if software_only {
-                    "backend gpu: only a software adapter answers; ask for it by name or use \
-                     backend cpu, which is faster"
+                    "backend gpu: only a software adapter was found; choose backend gpu to use \
+                     it, or backend cpu, which is faster"
                 } else {
-                    "backend gpu: no Vulkan, Metal or DX12 adapter answers; install a driver \
-                     (mesa-vulkan-drivers has one for machines without a GPU) or use backend cpu"
+                    "backend gpu: no Vulkan, Metal or DX12 adapter was found; install a driver \
+                     (mesa-vulkan-drivers includes one for machines without a GPU) or use backend cpu"
                 }
                 .to_owned(),
             ));
@@ -104,7 +104,7 @@ impl Gpu {
         }
         Err(Error::Device(
             "no Vulkan, Metal or DX12 adapter can draw in a window here; install a driver \
-             (mesa-vulkan-drivers has one for machines without a GPU)"
+             (mesa-vulkan-drivers includes one for machines without a GPU)"
                 .to_owned(),
         ))
     }
@@ -146,7 +146,7 @@ impl Gpu {
         }))
         .map_err(|e| {
             Error::Device(format!(
-                "backend gpu: {} does not open ({}); update its driver or use backend cpu",
+                "backend gpu: {} cannot be opened ({}); update its driver or use backend cpu",
                 info.name,
                 one_line(&e.to_string())
             ))

@@ -19,7 +19,9 @@ impl Gpu {
     pub(in crate::gpu) fn buffer(&self, label: &str, bytes: u64) -> Result<wgpu::Buffer> {
         let size = bytes.max(BUFFER_MIN).next_multiple_of(4);
         if !self.plans_only && size > self.device.limits().max_buffer_size {
-            return Err(self.error(&format!("holds no buffer of {size} bytes for {label}")));
+            return Err(
+                self.error(&format!("has no room for a buffer of {size} bytes for {label}"))
+            );
         }
         if self.injected.buffer_bytes.is_some_and(|most| size > most) {
             return Err(self.error("is out of memory"));
@@ -51,7 +53,7 @@ impl Gpu {
     pub(in crate::gpu) fn bindable_bytes(&self, label: &str, bytes: u64) -> Result<()> {
         if bytes > self.binding_limit {
             return Err(self.error(&format!(
-                "binds at most {} bytes at once where {label} needs {bytes}",
+                "binds at most {} bytes at once, but {label} needs {bytes}",
                 self.binding_limit
             )));
         }
@@ -150,7 +152,7 @@ impl Gpu {
             let failure = Arc::clone(&self.failure);
             buffer.slice(..).map_async(wgpu::MapMode::Read, move |result| {
                 if let Err(error) = result {
-                    note(&failure, format!("gave no results back ({error})"));
+                    note(&failure, format!("returned no results ({error})"));
                 }
             });
         }
@@ -163,7 +165,7 @@ impl Gpu {
             self.count_host(bytes);
             let view = buffer
                 .get_mapped_range(..)
-                .map_err(|e| self.error(&format!("gave no results back ({e})")))?;
+                .map_err(|e| self.error(&format!("returned no results ({e})")))?;
             out.push(view[..bytes as usize].to_vec());
             drop(view);
             buffer.unmap();

@@ -22,7 +22,7 @@ pub fn needed_limits() -> wgpu::Limits {
 pub(super) fn check_limits(name: &str, offered: &wgpu::Limits) -> Result<()> {
     let mut short = Vec::new();
     needed_limits().check_limits_with_fail_fn(offered, false, |limit, needed, has| {
-        short.push(format!("{limit} is {has} where igsr needs {needed}"));
+        short.push(format!("{limit} is {has}, but igsr needs {needed}"));
     });
     if short.is_empty() {
         return Ok(());

@@ -215,9 +215,9 @@ impl Gpu {
         let name = &self.info.name;
         Error::Device(match self.lost.get() {
             Some(why) => format!(
-                "backend gpu: {name} was lost ({why}): its driver was reset, updated or found a step \
-                 too long; the next call opens it again; if it is lost again, use smaller images or \
-                 backend cpu"
+                "backend gpu: {name} was lost ({why}): its driver was reset or updated, or a step \
+                 took too long; the next call opens it again; if it is lost again, use smaller \
+                 images or backend cpu"
             ),
             None => format!(
                 "backend gpu: {name} {what}; use fewer splats or smaller images, or backend cpu"

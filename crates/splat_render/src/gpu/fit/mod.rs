@@ -373,7 +373,7 @@ impl GpuFit {
                 return Err(Error::argument(
                     "splats",
                     format!(
-                        "{} lie in one 16x16 tile, the device takes {limit}; lower max_splats or \
+                        "{} are in one 16x16 tile, but the device takes {limit}; lower max_splats or \
                          use backend cpu",
                         count.total
                     ),

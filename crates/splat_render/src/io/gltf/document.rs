@@ -101,7 +101,7 @@ impl<'a> Document<'a> {
             (_, Some((kind, data)), _) if kind.starts_with("data:") => {
                 let bytes = STANDARD
                     .decode(data)
-                    .map_err(|e| self.bad(format!("has buffers[{k}] that is no base64 ({e})")))?;
+                    .map_err(|e| self.bad(format!("has buffers[{k}] that is not base64 ({e})")))?;
                 (next, Some(Cow::Owned(bytes)))
             }
             (Some(uri), _, _) => match files.get(uri) {
@@ -118,7 +118,7 @@ impl<'a> Document<'a> {
         let found = self.stores[place].len();
         if found < length {
             return Err(self.bad(format!(
-                "has buffers[{k}] of {found} bytes where {length} belong; it is truncated"
+                "has buffers[{k}] of {found} bytes instead of {length}; it is truncated"
             )));
         }
         Ok(place)

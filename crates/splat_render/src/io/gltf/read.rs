@@ -65,7 +65,7 @@ pub fn parse(bytes: &[u8], format: Format, named: &Named<'_>) -> Result<Loaded> 
         );
     }
     if others > 0 {
-        notes.push(format!("{others} meshes that are no splats are passed over."));
+        notes.push(format!("{others} meshes without splats are ignored."));
     }
 
     let degree = parts.iter().map(|part| part.degree).max().unwrap_or(0);
@@ -106,7 +106,7 @@ fn check_extension(
     match extension.get("colorSpace").and_then(Value::as_str) {
         None | Some(COLOR_SPACE) => {}
         Some(space) => {
-            let note = format!("Colors of the space {space:?} are taken for {COLOR_SPACE:?}.");
+            let note = format!("Colors of the space {space:?} are read as {COLOR_SPACE:?}.");
             if !notes.contains(&note) {
                 notes.push(note);
             }

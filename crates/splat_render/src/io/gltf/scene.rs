@@ -36,7 +36,9 @@ pub fn placed_meshes(document: &Document<'_>) -> Result<Vec<Placed>> {
     while let Some((index, parent)) = open.pop() {
         let node = document.item("nodes", index)?;
         if std::mem::replace(&mut seen[index], true) {
-            return Err(document.bad(format!("shows nodes[{index}] twice, which no glTF may")));
+            return Err(
+                document.bad(format!("shows nodes[{index}] twice, which glTF does not allow"))
+            );
         }
         let matrix = parent * local_matrix(node);
         if let Some(mesh) = number(node, "mesh") {

@@ -36,7 +36,7 @@ pub struct Bundle<'a> {
 impl<'a> Bundle<'a> {
     pub fn open(bytes: &'a [u8], named: &Named<'a>) -> Result<Self> {
         let zip = ZipArchive::new(Cursor::new(bytes)).map_err(|e| {
-            named.bad(format!("cannot be opened as the zip that a .sog is ({e}); copy it again"))
+            named.bad(format!("cannot be opened as the zip of a .sog ({e}); copy it again"))
         })?;
         Ok(Self { place: Place::Zip(Box::new(zip), unpacked_max(bytes.len())), named: *named })
     }
@@ -63,7 +63,7 @@ impl<'a> Bundle<'a> {
         };
         let mut parts = Path::new(name).components();
         if !matches!((parts.next(), parts.next()), (Some(Component::Normal(_)), None)) {
-            return Err(unreadable(&self.named, name, &"it lies in another folder"));
+            return Err(unreadable(&self.named, name, &"it is in another folder"));
         }
         let file = open_file(&folder.join(name)).map_err(|e| unreadable(&self.named, name, &e))?;
         let size = file.metadata().map_err(|e| unreadable(&self.named, name, &e))?.len();
@@ -101,7 +101,7 @@ impl<'a> Bundle<'a> {
         let used = used as u64;
         if pixels < used || pixels > 2 * used + SPARE_PIXELS {
             return Err(self.named.bad(format!(
-                "has an image '{name}' of {width}x{height} pixels where {used} are used; it is \
+                "has an image '{name}' of {width}x{height} pixels, but {used} are used; it is \
                  damaged"
             )));
         }

@@ -46,7 +46,7 @@ pub struct Rest {
 impl Meta {
     pub fn read(text: &[u8], named: &Named<'_>) -> Result<Self> {
         let meta: Value = serde_json::from_slice(text)
-            .map_err(|e| named.bad(format!("has a meta.json that is no JSON ({e})")))?;
+            .map_err(|e| named.bad(format!("has a meta.json that is not JSON ({e})")))?;
         let missing = |what: &str| {
             named.bad(format!("has no valid '{what}' in its meta.json; export it again"))
         };
@@ -57,7 +57,8 @@ impl Meta {
             }
             None => {
                 return Err(named.bad(
-                    "is a .sog of version 1; export it again as version 2, with SuperSplat say",
+                    "is a .sog of version 1; export it again as version 2, for example with \
+                     SuperSplat",
                 ));
             }
         }

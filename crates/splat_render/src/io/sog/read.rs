@@ -54,7 +54,7 @@ fn unpack(meta: &Meta, bundle: &mut Bundle<'_>, size: usize, named: &Named<'_>) 
         let [r, g, b, tag] = quats.rgba[i];
         let largest = tag.checked_sub(ROTATION_TAG).ok_or_else(|| {
             named.bad(format!(
-                "has a rotation tagged {tag}, where 252 to 255 are known; it is damaged"
+                "has a rotation tagged {tag}, but only 252 to 255 are known; it is damaged"
             ))
         })?;
         let others = [r, g, b].map(|c| (f64::from(c) / 255.0 - 0.5) * std::f64::consts::SQRT_2);
@@ -84,7 +84,7 @@ fn unpack_rest(
     let palette = bundle.image(&rest.centroids, used)?;
     if palette.width != PALETTE_COLUMNS * each {
         return Err(named.bad(format!(
-            "has a palette {} pixels wide where SH of degree {} take {}; it is damaged",
+            "has a palette {} pixels wide, but SH of degree {} take {}; it is damaged",
             palette.width,
             rest.degree,
             PALETTE_COLUMNS * each

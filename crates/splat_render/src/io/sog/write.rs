@@ -108,7 +108,7 @@ fn files(splats: &SplatArrays, antialiased: bool) -> Result<Vec<(&'static str, V
     let mut files = Vec::new();
     for (name, image) in &images {
         let bytes = webp(image).ok_or_else(|| {
-            unfit(&format!("a .sog holds 16384 x 16384 of them, not {}", splats.len()))
+            unfit(&format!("a .sog holds at most 16384 x 16384 splats, not {}", splats.len()))
         })?;
         files.push((*name, bytes));
     }
