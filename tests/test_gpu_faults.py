@@ -32,7 +32,7 @@ def no_faults_after(monkeypatch, verdicts):
     [
         ("shader", "Shader"),
         ("values", "computes wrong values: rasterize is off by"),
-        ("limits", "max_storage_buffers_per_shader_stage is 4 where igsr needs 8"),
+        ("limits", "max_storage_buffers_per_shader_stage is 4, but igsr needs 8"),
     ],
 )
 def test_auto_warns_once_and_uses_the_cpu(fault, message):

@@ -146,7 +146,7 @@ def test_a_chunk_is_a_splat_file(levels):
     chunk = igsr.Splats.load(out / name)
     assert 300 < len(chunk) <= 700
     assert chunk.sh_degree == 1
-    with pytest.raises(igsr.IgsrError, match="levels of detail; look at it with"):
+    with pytest.raises(igsr.IgsrError, match="levels of detail; open it with"):
         igsr.Splats.load(out / "lod-meta.json")
 
 

@@ -159,5 +159,5 @@ def test_ignored_parts_of_a_file_are_warnings(tmp_path):
     document = json.loads(path.read_text())
     document["meshes"][0]["primitives"].append({"attributes": {}})
     path.write_text(json.dumps(document))
-    with pytest.warns(UserWarning, match="no splats"):
+    with pytest.warns(UserWarning, match="without splats"):
         assert len(igsr.Splats.load(path)) == 40

@@ -225,9 +225,9 @@ SIDE_MAX: int  # largest side of a picture in pixels
 LEVELS_INDEX: str  # name of the file that lists the cells of a scene in levels of detail
 
 def splats_from_points(points: Float32, colors: Float32, sh_degree: int) -> dict[str, Float32]:
-    """One isotropic splat per point [P, 3] with colours [P, 3] in 0..1.
+    """One isotropic splat per point [P, 3] with colors [P, 3] in 0..1.
 
-    Returns means, quats, scales (logarithms of the mean distance to the three nearest neighbours),
+    Returns means, quats, scales (logarithms of the mean distance to the three nearest neighbors),
     opacities (logits of 0.1) and sh, as ``SplatArrays`` has them.
     """
 
@@ -238,7 +238,7 @@ def reduction(steps: int, coarse_to_fine: bool, step: int, longest: int) -> int:
     """
 
 def plane_sweep(
-    greys: list[Float32],
+    grays: list[Float32],
     usable: list[npt.NDArray[np.uint8] | None],
     viewmats: Float64,
     intrinsics: Float64,
@@ -247,7 +247,7 @@ def plane_sweep(
     """Depth maps by plane sweep, scored by the correlation of 7 x 7 patches.
 
     Args:
-        greys: grey in 0..1 of V photos, [H, W] each.
+        grays: gray in 0..1 of V photos, [H, W] each.
         usable: which of their pixels count, [H, W], not 0 where they do; or None for all.
         viewmats: [V, 4, 4], world-to-camera.
         intrinsics: [V, 4], fx, fy, cx, cy in pixels.
@@ -260,7 +260,7 @@ def plane_sweep(
     """
 
 class Fitter:
-    """A fit in progress; parameters and optimiser state stay on the device that computes."""
+    """A fit in progress; parameters and optimizer state stay on the device that computes."""
 
     def __init__(
         self,

@@ -4,14 +4,14 @@ use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
 
-/// The arguments of one call that nobody has taken yet.
+/// Arguments of one call that have not been taken yet.
 pub struct Call<'py> {
     function: &'static str,
     rest: Bound<'py, PyDict>,
 }
 
 impl<'py> Call<'py> {
-    /// Binds positional arguments to `names`, in their order, and joins those that were named.
+    /// Binds positional arguments to `names`, in order, and adds the keyword arguments.
     ///
     /// TypeError if there are more positional arguments than names, or one was given twice.
     pub fn bind(
@@ -76,7 +76,7 @@ impl<'py> Call<'py> {
         if self.rest.contains(name)? { self.take(name) } else { Ok(None) }
     }
 
-    /// TypeError if an argument is left that nobody knows.
+    /// TypeError if an unknown argument is left.
     pub fn finish(self) -> PyResult<()> {
         match self.rest.keys().iter().next() {
             None => Ok(()),
@@ -88,7 +88,7 @@ impl<'py> Call<'py> {
     }
 }
 
-/// The entry `name` of a dict of settings, None where it is absent or None.
+/// The entry `name` of a dict of settings, None if it is absent or None.
 pub fn setting<'py, T>(settings: &Bound<'py, PyDict>, name: &str) -> PyResult<Option<T>>
 where
     T: for<'a> FromPyObject<'a, 'py>,
@@ -96,7 +96,7 @@ where
     settings.get_item(name)?.map_or(Ok(None), |value| converted(name, &value))
 }
 
-/// A setting that is one of a few words, None where it is absent or None.
+/// A setting that is one of a few words, None if it is absent or None.
 pub fn choice<T: Copy>(
     settings: &Bound<'_, PyDict>,
     name: &str,

@@ -41,7 +41,7 @@ pub fn entry<'py, T: Element>(
     }
 }
 
-/// All elements of an array of shape `shape`, where -1 matches any size.
+/// All elements of an array of shape `shape`; -1 matches any size.
 pub fn elements<'a, T: Element>(
     name: &str,
     array: &'a PyReadonlyArrayDyn<'_, T>,
@@ -61,7 +61,7 @@ pub fn elements<'a, T: Element>(
     array.as_slice().map_err(|error| PyValueError::new_err(format!("{name}: {error}")))
 }
 
-/// The rows of an array of shape `leading` + `[N]`, where -1 matches any size.
+/// The rows of an array of shape `leading` + `[N]`; -1 matches any size.
 pub fn rows<'a, T: Element, const N: usize>(
     name: &str,
     array: &'a PyReadonlyArrayDyn<'_, T>,

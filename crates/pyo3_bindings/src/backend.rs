@@ -1,4 +1,4 @@
-//! Backends: which implementation of the stages runs, and on what.
+//! Backends: the implementation of the stages and its device.
 
 use std::ffi::CString;
 use std::sync::{Arc, LazyLock, Mutex, MutexGuard, PoisonError};
@@ -40,17 +40,17 @@ impl Backend {
     }
 }
 
-/// What became of opening a device.
+/// The result of opening a device.
 type Opened = Result<Arc<Gpu>, Error>;
 
-/// Devices of this process: the best real one, and the one that "gpu" names where there is none.
+/// Devices of this process: the best real one, and the one for "gpu", which may be a software adapter.
 #[derive(Default)]
 struct Devices {
     real: Option<Opened>,
     software: Option<Opened>,
-    /// Whether the user was told why "auto" is not the GPU.
+    /// Whether a warning has said why "auto" is not the GPU.
     warned: bool,
-    /// What tests make of the adapters.
+    /// Faults injected by tests.
     injected: Injected,
 }
 
@@ -58,12 +58,11 @@ static DEVICES: LazyLock<Mutex<Devices>> = LazyLock::new(Mutex::default);
 
 impl Devices {
     fn lock() -> MutexGuard<'static, Self> {
-        // What is opened is opened whole.
+        // A panic leaves no half-open device.
         DEVICES.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Opens the device that a slot is for, unless it holds one that is not lost. A failure is kept: to
-    /// try again at each call would cost seconds.
+    /// Opens a slot's device unless it is open. Failures are kept, because each try takes seconds.
     fn opened<'a>(slot: &'a mut Option<Opened>, software: bool, injected: &Injected) -> &'a Opened {
         if slot.as_ref().is_none_or(|opened| opened.as_ref().is_ok_and(|gpu| gpu.is_lost())) {
             *slot = Some(open_tested_with(software, injected));
@@ -84,8 +83,7 @@ impl Devices {
     }
 }
 
-/// The device of the backend "gpu": the best adapter, opened and tested once per process, and again
-/// after it was lost.
+/// The device of the backend "gpu": opened and tested once per process, and again if lost.
 pub fn gpu() -> PyResult<Arc<Gpu>> {
     let mut devices = Devices::lock();
     match devices.named() {

@@ -1,5 +1,4 @@
-//! What only the benchmark needs: stages timed without the conversion of arrays, the machine's peak
-//! speed, and the pixels at which implementations may differ by rounding.
+//! Functions for benchmarks: timed stages, the machine's peak speed, and pixels that rounding may change.
 
 use std::time::{Duration, Instant};
 
@@ -19,8 +18,8 @@ use crate::stages::{
     PARAMETERS, Parameters, PictureGradients, Real, SplatArrays, View, projected_from, with_stages,
 };
 
-/// Speed of multiply-adds on all CPU threads, in 10^9 floating-point operations per second, measured
-/// for about `seconds` with the instruction set that the backend "cpu" uses.
+/// Speed of multiply-adds on all threads in Gflop/s, measured for `seconds` with the CPU backend's
+/// instructions.
 #[pyfunction]
 pub fn peak_multiply_add(py: Python<'_>, seconds: f64) -> PyResult<f64> {
     let duration = Duration::try_from_secs_f64(seconds)
@@ -45,14 +44,14 @@ pub fn band_pixels<'py>(
     shaped(py, bytes, &[height as usize, width as usize])
 }
 
-/// Milliseconds of one call, and what it returned.
+/// Milliseconds of one call, and its result.
 fn timed<R>(call: impl FnOnce() -> Result<R>) -> Result<(f64, R)> {
     let started = Instant::now();
     let value = call()?;
     Ok((started.elapsed().as_secs_f64() * 1e3, value))
 }
 
-/// What the timed backward stages start from, and how often stages run.
+/// Inputs of the timed backward stages, and the number of repeats.
 struct Timing<'py> {
     background: Bound<'py, PyAny>,
     v_image: PictureGradients<'py>,

@@ -1,5 +1,4 @@
-//! The example capture: files of `examples/tea_table` that are built into the module, so that every
-//! installation has them and the repository has them once.
+//! The example capture: files of `examples/tea_table`, built into the module.
 
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict};
@@ -10,8 +9,7 @@ macro_rules! file {
     };
 }
 
-/// Names within the capture's folder, and contents. The photos are those that
-/// `igsr refine examples/tea_table --photos 8` takes, and all that are held out.
+/// File names and contents: the photos of `igsr refine examples/tea_table --photos 8` and held-out ones.
 const FILES: &[(&str, &[u8])] = &[
     file!("transforms_train.json"),
     file!("transforms_test.json"),
@@ -33,8 +31,7 @@ const FILES: &[(&str, &[u8])] = &[
     file!("test/007.png"),
 ];
 
-/// The files of the example capture: contents by name. `transforms_train.json` names photos that are
-/// not among them.
+/// The example capture's contents by name. `transforms_train.json` names further photos.
 #[pyfunction]
 pub fn example_files(py: Python<'_>) -> PyResult<Bound<'_, PyDict>> {
     let files = PyDict::new(py);

@@ -6,14 +6,14 @@ use splat_render::fit::{Background, CameraConfig, DensityControl, FitConfig, Foc
 
 use crate::arguments::{choice, setting};
 
-/// What both sides of photos are divided by in a step; see [`FitConfig::reduction`].
+/// Factor by which a step reduces both sides of photos; see [`FitConfig::reduction`].
 #[pyfunction]
 pub fn reduction(steps: u32, coarse_to_fine: bool, step: u32, longest: u32) -> u32 {
     FitConfig { steps: steps.max(1), coarse_to_fine, ..FitConfig::default() }
         .reduction(step, longest)
 }
 
-/// The settings of a fit; what is absent or None takes the default.
+/// The settings of a fit; an absent or None entry takes the default.
 pub fn config_from(config: &Bound<'_, PyDict>) -> PyResult<FitConfig> {
     let default = FitConfig::default();
     let densities = [
@@ -36,7 +36,7 @@ pub fn config_from(config: &Bound<'_, PyDict>) -> PyResult<FitConfig> {
             rate: number("camera_rate", default.rate)?,
             decay: number("camera_decay", default.decay)?,
             warm_up: number("camera_warm_up", default.warm_up)?,
-            // Splats that stay where they are hold the cameras by themselves.
+            // Frozen splats already fix the gauge of the cameras.
             anchored: !frozen,
         })
     } else {
@@ -53,7 +53,6 @@ pub fn config_from(config: &Bound<'_, PyDict>) -> PyResult<FitConfig> {
         density,
         background,
         dropout: setting(config, "dropout")?.unwrap_or(default.dropout),
-        hull: setting(config, "hull")?.unwrap_or(default.hull),
         depth_weight: setting(config, "depth_weight")?.unwrap_or(default.depth_weight),
         coarse_to_fine: setting(config, "coarse_to_fine")?.unwrap_or(default.coarse_to_fine),
         rates: if frozen { Rates::ZERO } else { default.rates },

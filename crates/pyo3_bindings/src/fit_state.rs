@@ -1,16 +1,16 @@
-//! Everything a fit needs to go on, as dicts of numpy arrays: splats, optimiser moments, cameras.
+//! Everything a fit needs to go on, as dicts of numpy arrays: splats, optimizer moments, cameras.
 
 use glam::DMat4;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use splat_render::fit::{CameraState, DensityStats, Exposure, ExposureState, FitState, Hold};
+use splat_render::fit::{CameraState, DensityStats, Exposure, ExposureState, FitState, PosePrior};
 
 use crate::arrays::{elements, entry, rows, shaped, shaped_rows};
 use crate::camera::viewmat;
 use crate::splat_arrays::splat_arrays_from;
 
-/// Reads the state of a fit and the steps done. Without moments, the fit is new and starts at
-/// `first_step`. The last `frozen` splats stay as they are.
+/// Reads a fit's state and step; without moments, a new fit at `first_step`. `frozen` counts from the
+/// end.
 pub fn state_from(
     dict: &Bound<'_, PyDict>,
     first_step: u32,
@@ -63,8 +63,8 @@ pub fn camera_state_from(dict: &Bound<'_, PyDict>, count: usize) -> PyResult<Opt
 /// Starts of exposures and the pulls to them.
 pub type ExposureStarts = (Vec<Option<Exposure<f64>>>, Vec<f64>);
 
-/// Where exposures start: `gains` [V, 3], `offsets` [V, 3], `fitted` [V], False for photos that have
-/// none of their own, and `pulls` [V] to the starts.
+/// Initial exposures: `gains` [V, 3], `offsets` [V, 3], `fitted` [V] (False for photos without an initial
+/// exposure) and `pulls` [V] toward the initial values.
 pub fn exposures_from(dict: &Bound<'_, PyDict>, count: usize) -> PyResult<ExposureStarts> {
     let n = count as isize;
     let gains = entry::<f64>(dict, "gains")?;
@@ -105,7 +105,7 @@ pub fn exposure_state_from(
     }))
 }
 
-/// Writes what [`exposure_state_from`] reads.
+/// Writes the entries that [`exposure_state_from`] reads.
 pub fn set_exposure_state(dict: &Bound<'_, PyDict>, state: ExposureState) -> PyResult<()> {
     let (py, n) = (dict.py(), state.gains.len());
     dict.set_item("exposure_gains", shaped_rows(py, state.gains, &[n])?)?;
@@ -119,7 +119,7 @@ pub fn set_exposure_state(dict: &Bound<'_, PyDict>, state: ExposureState) -> PyR
 /// Pose priors of the cameras: `viewmats` [V, 4, 4], `intrinsics` [V, 4], `information` [V, 6, 6] (the
 /// inverse covariance of rotation and translation), `focal_information` [V] (of the logarithm of the
 /// focal length).
-pub fn holds_from(dict: &Bound<'_, PyDict>, count: usize) -> PyResult<Vec<Hold>> {
+pub fn holds_from(dict: &Bound<'_, PyDict>, count: usize) -> PyResult<Vec<PosePrior>> {
     let n = count as isize;
     let viewmats = entry::<f64>(dict, "viewmats")?;
     let viewmats = rows::<f64, 4>("viewmats", &viewmats, &[n, 4])?.as_chunks::<4>().0;
@@ -131,7 +131,7 @@ pub fn holds_from(dict: &Bound<'_, PyDict>, count: usize) -> PyResult<Vec<Hold>>
     let focal_information = elements("focal_information", &focal_information, &[n])?;
     let hold = |i: usize| {
         let [fx, fy, ..] = intrinsics[i];
-        Hold {
+        PosePrior {
             viewmat: viewmat(&viewmats[i]),
             focal: [fx, fy],
             pose: information[i],
@@ -141,7 +141,7 @@ pub fn holds_from(dict: &Bound<'_, PyDict>, count: usize) -> PyResult<Vec<Hold>>
     Ok((0..count).map(hold).collect())
 }
 
-/// Writes what [`camera_state_from`] reads.
+/// Writes the entries that [`camera_state_from`] reads.
 pub fn set_camera_state(dict: &Bound<'_, PyDict>, state: CameraState) -> PyResult<()> {
     let (py, n) = (dict.py(), state.viewmats.len());
     set_cameras(dict, &state.viewmats, state.intrinsics)?;

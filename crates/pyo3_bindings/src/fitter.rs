@@ -50,7 +50,7 @@ impl Fitter {
 
 #[pymethods]
 impl Fitter {
-    /// A fit to photos, from parameters or from where an earlier fit stopped.
+    /// A fit to photos, started from splats or resumed from a state.
     #[new]
     #[pyo3(
         signature = (*positional, **named),
@@ -86,7 +86,7 @@ impl Fitter {
                 fitter.set_rigs(&rigs)?;
             }
             if let Some(holds) = holds {
-                fitter.hold_cameras(holds)?;
+                fitter.set_pose_priors(holds)?;
             }
             if let Some((exposures, pulls)) = exposures {
                 fitter.start_exposures(&exposures, &pulls)?;
@@ -142,7 +142,7 @@ impl Fitter {
         Ok(dict)
     }
 
-    /// The exposures as they are now, where they are fitted: `gains` and `offsets`, [V, 3] each.
+    /// The current exposures if they are fitted: `gains` and `offsets`, [V, 3] each.
     fn exposures<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyDict>>> {
         let Some(state) = py.detach(|| self.lock()?.exposure_state().map_err(to_python))? else {
             return Ok(None);
@@ -180,7 +180,7 @@ impl Fitter {
     }
 }
 
-/// One round splat per point, as large as the mean distance to its three nearest neighbours.
+/// One round splat per point, as large as the mean distance to its three nearest neighbors.
 #[pyfunction]
 pub fn splats_from_points<'py>(
     py: Python<'py>,

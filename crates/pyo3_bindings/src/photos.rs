@@ -24,8 +24,7 @@ fn weights_from(name: &str, mask: &Bound<'_, PyAny>, size: [usize; 2]) -> PyResu
     Ok(bytes.iter().map(|&counts| if counts == 0 { 0.0 } else { 1.0 }).collect())
 }
 
-/// The depths of `count` photos, from one entry of `depths` each: None, or z and confidence
-/// `[H, W, 2]`.
+/// Depths of `count` photos; an entry of `depths` is None, or z and confidence `[H, W, 2]`.
 fn depths_from(call: &Call<'_>, count: usize) -> PyResult<Vec<Option<TargetDepth>>> {
     let Some(depths) = call.optional::<Bound<'_, PyList>>("depths")? else {
         return Ok(vec![None; count]);
@@ -51,8 +50,7 @@ fn depths_from(call: &Call<'_>, count: usize) -> PyResult<Vec<Option<TargetDepth
     depths.iter().enumerate().map(depth).collect()
 }
 
-/// The photos of a fit: one entry each of `images`, `masks`, `backgrounds` and `schedule`,
-/// and of `depths`, where it is given.
+/// The photos: `images`, `masks`, `backgrounds`, `schedule` and, if given, `depths`.
 pub fn targets_from(call: &Call<'_>) -> PyResult<Vec<Target>> {
     let (images, masks) =
         (call.take::<Bound<'_, PyList>>("images")?, call.take::<Bound<'_, PyList>>("masks")?);

@@ -4,7 +4,7 @@ use numpy::PyUntypedArrayMethods;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList};
-use splat_render::fit::{GreyPhoto, Sweep};
+use splat_render::fit::{GrayPhoto, Sweep};
 
 use crate::arrays::{array, elements, shaped};
 use crate::camera::cameras;
@@ -14,22 +14,22 @@ use crate::error::to_python;
 #[pyfunction]
 pub fn plane_sweep<'py>(
     py: Python<'py>,
-    greys: &Bound<'py, PyList>,
+    grays: &Bound<'py, PyList>,
     usable: &Bound<'py, PyList>,
     viewmats: &Bound<'py, PyAny>,
     intrinsics: &Bound<'py, PyAny>,
     sweeps: Vec<(usize, Vec<usize>, [f32; 2], usize)>,
 ) -> PyResult<Bound<'py, PyList>> {
-    if usable.len() != greys.len() {
-        return Err(PyValueError::new_err("usable: must have an entry for each of greys"));
+    if usable.len() != grays.len() {
+        return Err(PyValueError::new_err("usable: must have an entry for each of grays"));
     }
-    let mut pixels = Vec::with_capacity(greys.len());
-    let mut sizes = Vec::with_capacity(greys.len());
-    for (i, (grey, usable)) in greys.iter().zip(usable.iter()).enumerate() {
-        let name = format!("greys[{i}]");
-        let grey = array::<f32>(&name, &grey)?;
-        let values = elements(&name, &grey, &[-1, -1])?.to_vec();
-        let (height, width) = (grey.shape()[0], grey.shape()[1]);
+    let mut pixels = Vec::with_capacity(grays.len());
+    let mut sizes = Vec::with_capacity(grays.len());
+    for (i, (gray, usable)) in grays.iter().zip(usable.iter()).enumerate() {
+        let name = format!("grays[{i}]");
+        let gray = array::<f32>(&name, &gray)?;
+        let values = elements(&name, &gray, &[-1, -1])?.to_vec();
+        let (height, width) = (gray.shape()[0], gray.shape()[1]);
         let side = |side: usize| {
             u32::try_from(side).map_err(|_| PyValueError::new_err(format!("{name}: is too large")))
         };
@@ -45,10 +45,10 @@ pub fn plane_sweep<'py>(
         pixels.push((values, usable));
     }
     let cameras = cameras(viewmats, intrinsics, &sizes)?;
-    let photos: Vec<GreyPhoto> = cameras
+    let photos: Vec<GrayPhoto> = cameras
         .into_iter()
         .zip(pixels)
-        .map(|(camera, (grey, usable))| GreyPhoto { camera, grey, usable })
+        .map(|(camera, (gray, usable))| GrayPhoto { camera, gray, usable })
         .collect();
     let sweeps: Vec<Sweep> = sweeps
         .into_iter()

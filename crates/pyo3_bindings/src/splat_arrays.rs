@@ -8,7 +8,7 @@ use splat_render::fit::SplatArrays;
 
 use crate::arrays::{elements, entry, rows, shaped, shaped_rows};
 
-/// Reads splat parameters, or moments of the optimiser under a prefix.
+/// Reads splat parameters, or moments of the optimizer under a prefix.
 pub fn splat_arrays_from(dict: &Bound<'_, PyDict>, prefix: &str) -> PyResult<SplatArrays> {
     fn copied<const N: usize>(
         dict: &Bound<'_, PyDict>,
@@ -42,7 +42,7 @@ pub fn splat_arrays_from(dict: &Bound<'_, PyDict>, prefix: &str) -> PyResult<Spl
     })
 }
 
-/// Writes what [`splat_arrays_from`] reads.
+/// Writes the entries that [`splat_arrays_from`] reads.
 pub fn set_splat_arrays(
     dict: &Bound<'_, PyDict>,
     prefix: &str,

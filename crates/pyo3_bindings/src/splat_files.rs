@@ -12,7 +12,7 @@ use crate::arrays::{array, row, rows, shaped};
 use crate::error::to_python;
 use crate::splat_arrays::{set_splat_arrays, splat_arrays_from};
 
-/// Reads a splat file of any format. `notes` say what was ignored.
+/// Reads a splat file of any format. `notes` list ignored content.
 #[pyfunction]
 pub fn read_splats<'py>(py: Python<'py>, path: PathBuf) -> PyResult<Bound<'py, PyDict>> {
     let loaded = py.detach(|| splat_render::io::read_splats(&path)).map_err(to_python)?;
@@ -25,8 +25,7 @@ pub fn read_splats<'py>(py: Python<'py>, path: PathBuf) -> PyResult<Bound<'py, P
     Ok(dict)
 }
 
-/// Writes a splat file in the format of its ending, whole or not at all. Returns a message for
-/// each thing that the format cannot hold.
+/// Writes a file in the format of its ending, whole or not at all; returns notes on omitted content.
 #[pyfunction]
 pub fn write_splats(
     py: Python<'_>,

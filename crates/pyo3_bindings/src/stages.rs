@@ -6,6 +6,7 @@ use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
 use splat_render::cpu::Cpu;
 use splat_render::reference::Reference;
+use splat_render::stages::Float;
 use splat_render::{
     Colors, Image, ImageGradients, ProjectOptions, Projected, ProjectedGradients, SplatGradients,
     SplatParams, Stages,
@@ -18,7 +19,7 @@ use crate::camera::camera;
 use crate::error::to_python;
 
 /// A number type that numpy and the stages share: f32 or f64.
-pub trait Real: Element + Copy + Default + Send + Sync {}
+pub trait Real: Element + Float + Default + Send + Sync {}
 impl Real for f32 {}
 impl Real for f64 {}
 
@@ -39,7 +40,7 @@ pub const PARAMETERS: [&str; 5] = ["means", "quats", "scales", "opacities", "col
 
 /// Arguments of `project` and `project_backward` besides the parameters.
 pub struct View {
-    /// None: colours are given, not coefficients.
+    /// None: colors are given, not coefficients.
     pub sh_degree: Option<u32>,
     /// Whether scales are logarithms and opacities logits.
     pub raw_parameters: bool,
@@ -373,7 +374,7 @@ fn project_backward_with<'py, T: Real>(
     };
     if projected.len() != params.len() {
         return Err(PyValueError::new_err(format!(
-            "projected: has {} splats where means has {}",
+            "projected: has {} splats, but means has {}",
             projected.len(),
             params.len()
         )));

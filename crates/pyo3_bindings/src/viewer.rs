@@ -4,7 +4,7 @@ use std::ffi::OsString;
 
 use pyo3::prelude::*;
 
-/// Does what a command line of `splat-view` asks for; returns the exit status.
+/// Runs `splat-view` with a command line; returns the exit status.
 #[pyfunction]
 pub fn run_viewer(py: Python<'_>, words: Vec<OsString>) -> u8 {
     py.detach(|| splat_view::run(words))

@@ -1,4 +1,4 @@
-//! Pinhole cameras: OpenCV axes (x right, y down, z forward), pixel centres at +0.5.
+//! Pinhole cameras: OpenCV axes (x right, y down, z forward), pixel centers at +0.5.
 
 use glam::{DMat3, DMat4, DVec3};
 
@@ -29,7 +29,7 @@ pub(crate) fn check_size(width: u32, height: u32) -> Result<()> {
     if width == 0 || height == 0 || width > SIDE_MAX || height > SIDE_MAX {
         return Err(Error::argument(
             "width, height",
-            format!("must lie in 1..={SIDE_MAX}, got {width} x {height}"),
+            format!("must be in 1..={SIDE_MAX}, got {width} x {height}"),
         ));
     }
     Ok(())
@@ -79,13 +79,12 @@ impl Camera {
         self.viewmat.w_axis.truncate()
     }
 
-    /// Camera centre in the world frame.
+    /// Camera center in the world frame.
     pub fn center(&self) -> DVec3 {
         -(self.rotation().transpose() * self.translation())
     }
 
-    /// Limits of x/z and y/z in the Jacobian: `[x_low, x_high, y_low, y_high]`,
-    /// [`JACOBIAN_MARGIN`] of tan(fov/2) beyond each image edge.
+    /// `[x_low, x_high, y_low, y_high]` of x/z and y/z in the Jacobian; see [`JACOBIAN_MARGIN`].
     pub fn jacobian_limits(&self) -> [f64; 4] {
         let margin = f64::from(JACOBIAN_MARGIN);
         let (w, h) = (f64::from(self.width), f64::from(self.height));

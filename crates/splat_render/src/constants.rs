@@ -1,5 +1,4 @@
-//! Every numeric threshold of the renderer, once, as the f32 value that all three implementations
-//! use (the f64 reference widens it, so that no comparison lands on another side there).
+//! The renderer's thresholds as f32; the f64 reference widens them, so that comparisons agree.
 
 /// Side of a square tile in pixels. 16 keeps a tile's state inside the first-level cache.
 pub const TILE: u32 = 16;
@@ -16,11 +15,11 @@ pub const DEPTH_ALPHA: f32 = 0.5;
 /// No splat is fully opaque, so that `1 - alpha` stays invertible and gradients pass through it.
 pub const ALPHA_MAX: f32 = 0.99;
 
-/// A pixel stops before its transmittance would fall under this; what lies behind is invisible.
+/// A pixel stops before its transmittance falls below this; splats farther away are invisible.
 pub const TRANSMITTANCE_MIN: f32 = 1e-4;
 
 /// Default variance in px^2 added to both axes of every 2D covariance (EWA low-pass; gsplat's
-/// `eps2d`), so that no splat falls between pixel centres.
+/// `eps2d`), so that no splat falls between pixel centers.
 pub const BLUR: f32 = 0.3;
 
 /// Default near plane in world units, as gsplat's.

@@ -1,6 +1,6 @@
-//! The one error type: each message names the argument, device or file, and how to mend it.
+//! The error type. Each message names the argument, device or file, and the fix.
 
-/// What can go wrong; each displays as one message.
+/// An error; each displays as one message.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// An argument has a wrong shape, size or value.
@@ -8,7 +8,7 @@ pub enum Error {
     Argument {
         /// Name of the argument as the caller wrote it.
         argument: String,
-        /// What is wrong with it and what would be right.
+        /// The problem, and a valid value.
         reason: String,
     },
     /// No adapter answers for the backend that was asked for.
@@ -22,7 +22,7 @@ pub enum Error {
     File {
         /// The file.
         path: String,
-        /// What is wrong with it and what would mend it.
+        /// The problem, and the fix.
         reason: String,
     },
 }

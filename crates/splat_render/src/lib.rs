@@ -1,27 +1,27 @@
-//! A differentiable renderer of Gaussian splats and a fitter of them to photos.
+//! A differentiable renderer of Gaussian splats, and a fitter of splats to photos.
 //!
-//! Every stage exists three times, under one name and in files of one name: in [`reference`] (f64,
-//! plain, what the others are tested against), [`cpu`] (f32, SIMD, threads) and [`gpu`] (WGSL compute
-//! kernels through wgpu). They share the trait [`Stages`]:
+//! Every stage has three implementations, under the same name and in files of the same name: in
+//! [`reference`] (f64, plain, the standard for tests), [`cpu`] (f32, SIMD, threads) and [`gpu`] (WGSL
+//! compute kernels through wgpu). They share the trait [`Stages`]:
 //!
 //! | stage | from | to |
 //! |---|---|---|
 //! | project | splats ([`SplatParams`]), [`Camera`] | 2D splats ([`Projected`]) |
 //! | bin | 2D splats | lists of splats per tile, inside the two rasterize stages |
-//! | rasterize | 2D splats, background | [`Image`]: colour, alpha, depth |
-//! | exposure | image, gain and offset ([`stages::Exposure`]) | the image's colours as a photo has them |
+//! | rasterize | 2D splats, background | [`Image`]: color, alpha, depth |
+//! | exposure | image, gain and offset ([`stages::Exposure`]) | corrected colors |
 //! | loss | image, photo ([`target::Target`]) | L1 and D-SSIM, and the image's gradient |
-//! | exposure_backward | gradient of those colours | gradients of image, gain and offset |
+//! | exposure_backward | gradient of the corrected colors | gradients of image, gain and offset |
 //! | rasterize_backward | the image's gradient | gradients of the 2D splats |
 //! | project_backward | gradients of the 2D splats | gradients of splats and camera |
-//! | adam | gradients of the splats | splats after one optimiser step |
+//! | adam | gradients of the splats | splats after one optimizer step |
 //!
-//! [`fit`] runs them in a loop on a [`fit::FitDevice`], which keeps splats and photos where its kernels
-//! run. [`gpu_check`] opens a GPU that is known to compute right. [`io`] reads and writes files of splats and pictures,
-//! and [`levels`] scenes in levels of detail.
+//! [`fit`] runs them in a loop on a [`fit::FitDevice`], which keeps splats and photos on its device.
+//! [`gpu_check`] opens a GPU that is known to compute correctly. [`io`] reads and writes files of splats
+//! and pictures, and [`levels`] scenes in levels of detail.
 //!
-//! Frames: the world is the scene's own, less an f64 origin that its files keep; cameras are OpenCV's
-//! (x right, y down, z forward), pixel centres at +0.5. Errors are [`Error`].
+//! Frames: world coordinates are relative to an f64 origin that files store; cameras are OpenCV's (x
+//! right, y down, z forward), with pixel centers at +0.5. Errors are [`Error`].
 
 pub mod camera;
 pub mod constants;

@@ -1,4 +1,4 @@
-//! Splats in an order in which neighbours in space are neighbours in memory or in a file. Fits gain by
+//! Splats in an order in which neighbors in space are neighbors in memory or in a file. Fits gain by
 //! it, and so do formats that pack runs of splats against the run's own bounds, or as images.
 
 /// Bits per axis of the cells that are ordered.

@@ -1,5 +1,4 @@
-//! Real spherical harmonics of degree 0-4 in the basis, order and signs of 3DGS and gsplat
-//! (Sloan, "Efficient Spherical Harmonic Evaluation", 2013).
+//! Real spherical harmonics of degree 0-4 in the basis, order and signs of 3DGS (Sloan, 2013).
 
 use std::ops::{Add, Mul, Neg, Sub};
 
@@ -28,7 +27,7 @@ pub(crate) const C4: [f64; 6] = [
 /// Half of `C4[2]`, of the (xx - yy)(7zz - 1) term.
 pub(crate) const C4_HALF: f64 = 0.473_087_347_878_780_04;
 
-/// What the basis is computed in: f32, f64, or several f32 side by side.
+/// Number type of the basis: f32, f64, or several f32 side by side.
 pub trait Number:
     Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> + Neg<Output = Self>
 {

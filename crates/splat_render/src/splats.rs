@@ -6,34 +6,34 @@ use crate::constants::{SH_COEFFS_MAX, SH_DEGREE_MAX};
 use crate::error::{Error, Result};
 use crate::sh;
 
-/// Colour of each splat.
+/// Color of each splat.
 #[derive(Debug, Clone, Copy)]
 pub enum Colors<'a, T> {
-    /// Spherical harmonics; colour = max(0, 0.5 + SH(direction from the camera to the mean)).
+    /// Spherical harmonics; color = max(0, 0.5 + SH(direction from the camera to the mean)).
     Sh {
-        /// Degree that is evaluated, 0..=4; may be lower than what is stored.
+        /// Degree to evaluate, 0..=4; may be lower than the stored one.
         degree: u32,
         /// Stored coefficients per splat, at least `(degree + 1)^2`.
         stride: usize,
         /// `[N * stride]` RGB coefficients, splat-major.
         coeffs: &'a [[T; 3]],
     },
-    /// `[N]` colours that do not depend on the view, used as they are.
+    /// `[N]` colors that do not depend on the view, used as they are.
     Direct(&'a [[T; 3]]),
 }
 
 /// Parameters of N splats, borrowed.
 #[derive(Debug, Clone, Copy)]
 pub struct SplatParams<'a, T> {
-    /// `[N]` centres in the world frame (less the scene's origin).
+    /// `[N]` centers in the world frame (less the scene's origin).
     pub means: &'a [[T; 3]],
-    /// `[N]` rotations as wxyz quaternions, normalised inside.
+    /// `[N]` rotations as wxyz quaternions, normalized inside.
     pub quats: &'a [[T; 4]],
     /// `[N]` standard deviations along the splat's axes: logs if `raw`, else themselves.
     pub scales: &'a [[T; 3]],
     /// `[N]` opacities: logits if `raw`, else themselves.
     pub opacities: &'a [T],
-    /// Colours.
+    /// Colors.
     pub colors: Colors<'a, T>,
     /// Whether `scales` are logarithms and `opacities` logits (as fitted and stored).
     pub raw: bool,
@@ -60,10 +60,7 @@ impl<T> SplatParams<'_, T> {
         ];
         for (name, length) in lengths {
             if length != n {
-                return Err(Error::argument(
-                    name,
-                    format!("has {length} rows where means has {n}"),
-                ));
+                return Err(Error::argument(name, format!("has {length} rows, but means has {n}")));
             }
         }
         let rows = match self.colors {
@@ -74,7 +71,8 @@ impl<T> SplatParams<'_, T> {
                     return Err(Error::argument(
                         "sh_degree",
                         format!(
-                            "degree {degree} needs {needed} coefficients of at most {SH_COEFFS_MAX}, got {stride}"
+                            "degree {degree} needs {needed} coefficients of at most \
+                             {SH_COEFFS_MAX}, got {stride}"
                         ),
                     ));
                 }
@@ -85,7 +83,7 @@ impl<T> SplatParams<'_, T> {
             }
         };
         if rows != n {
-            return Err(Error::argument("colors", format!("has {rows} rows where means has {n}")));
+            return Err(Error::argument("colors", format!("has {rows} rows, but means has {n}")));
         }
         Ok(())
     }
@@ -94,9 +92,9 @@ impl<T> SplatParams<'_, T> {
 /// Parameters of N splats as they are fitted and stored. The same layout holds Adam's moments.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct SplatArrays<T = f32> {
-    /// `[N]` centres, world frame less the scene's origin.
+    /// `[N]` centers, world frame less the scene's origin.
     pub means: Vec<[T; 3]>,
-    /// `[N]` wxyz, not normalised.
+    /// `[N]` wxyz, not normalized.
     pub quats: Vec<[T; 4]>,
     /// `[N]` logarithms of the standard deviations.
     pub scales: Vec<[T; 3]>,
@@ -180,12 +178,12 @@ pub(crate) struct SplatSlices<'a> {
     pub quats: &'a mut [[f32; 4]],
     pub scales: &'a mut [[f32; 3]],
     pub opacities: &'a mut [f32],
-    /// Rows of colour, equally many per splat.
+    /// Rows of color, equally many per splat.
     pub sh: &'a mut [[f32; 3]],
 }
 
 impl<'a> SplatSlices<'a> {
-    /// The first `n` splats, of equally many rows of colour each.
+    /// The first `n` splats, of equally many rows of color each.
     pub fn first(self, n: usize) -> SplatSlices<'a> {
         let stride = self.sh.len() / self.means.len().max(1);
         SplatSlices {
@@ -197,8 +195,7 @@ impl<'a> SplatSlices<'a> {
         }
     }
 
-    /// Borrowed as the stages take them, where they are raw parameters: SH of `degree` of `stride`
-    /// rows per splat.
+    /// Borrows raw parameters for the stages: SH of `degree` with `stride` rows per splat.
     pub fn params(&self, degree: u32, stride: usize) -> SplatParams<'_, f32> {
         SplatParams {
             means: self.means,
@@ -210,7 +207,7 @@ impl<'a> SplatSlices<'a> {
         }
     }
 
-    /// Runs of `size` splats, in order, the last one shorter; each splat has `stride` rows of colour.
+    /// Runs of `size` splats, in order, the last one shorter; each splat has `stride` rows of color.
     pub fn into_blocks(
         self,
         size: usize,
@@ -250,7 +247,7 @@ impl<T> SplatArrays<T> {
         sh::coeffs(self.sh_degree)
     }
 
-    /// Borrowed as the stages take them, evaluating SH up to `degree` (at most what is stored).
+    /// Borrows the parameters for the stages, with SH up to `degree`, capped at the stored one.
     pub fn params(&self, degree: u32) -> SplatParams<'_, T> {
         SplatParams {
             means: &self.means,

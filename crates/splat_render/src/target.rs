@@ -1,4 +1,4 @@
-//! Photos to fit to, with what each counts in the loss.
+//! Photos to fit, and the weights of their pixels.
 
 use crate::error::{Error, Result};
 
@@ -16,34 +16,33 @@ pub struct Target {
     /// `[H * W]` weight of each pixel in the loss, or None for 1 everywhere. The loss is a mean over
     /// the pixels whose weight is not 0: a photo of small weights counts less than others.
     pub weights: Option<Vec<f32>>,
-    /// Depths of its pixels, where they are known.
+    /// Depths of its pixels, if known.
     pub depth: Option<TargetDepth>,
-    /// RGB in 0..=1 of the background in a photo without alpha, where it is known: renders are
-    /// compared over it.
+    /// RGB in 0..=1 of the known background in a photo without alpha: renders are composited over it.
     pub background: Option<[f32; 3]>,
     /// How many steps of a round are of it, at least 1.
     pub turns: u32,
-    /// The first step that is not of it any more, where there is one.
+    /// The first step without the photo, or None.
     pub until: Option<u32>,
 }
 
-/// How far away what a photo shows is, as a sensor or a network found it.
+/// Depths of a photo's pixels, from a sensor or a network.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TargetDepth {
-    /// `[H * W]` camera-space z, world units, above 0 where its confidence is.
+    /// `[H * W]` camera-space z, world units; above 0 if its confidence is.
     pub depths: Vec<f32>,
-    /// `[H * W]` confidence of each, in 0..=1; 0 where the depth is not known.
+    /// `[H * W]` confidence in 0..=1; 0 if the depth is unknown.
     pub confidences: Vec<f32>,
 }
 
 impl TargetDepth {
-    /// Checks sizes and values; what is wrong follows the name of the photo.
+    /// Checks sizes and values; the error continues the photo's name.
     pub(crate) fn validate(&self, pixels: usize) -> std::result::Result<(), &'static str> {
         if self.depths.len() != pixels || self.confidences.len() != pixels {
-            return Err("has depths that are not of the image's size");
+            return Err("has depths of another size than the image");
         }
         if !self.confidences.iter().all(|c| (0.0..=1.0).contains(c)) {
-            return Err("has a depth's confidence that does not lie in 0..=1");
+            return Err("has a depth's confidence outside of 0..=1");
         }
         let mut known = self.depths.iter().zip(&self.confidences).filter(|(_, c)| **c > 0.0);
         if !known.all(|(z, _)| z.is_finite() && *z >= f32::MIN_POSITIVE) {
@@ -52,14 +51,14 @@ impl TargetDepth {
         Ok(())
     }
 
-    /// What a pixel of confidence 1 counts in the loss, a mean; 0 where no depth is known.
+    /// Weight of a pixel of confidence 1 in the loss, which is a mean; 0 without known depths.
     pub(crate) fn scale(&self) -> f64 {
         let count = self.confidences.iter().filter(|c| **c > 0.0).count();
         if count > 0 { 1.0 / count as f64 } else { 0.0 }
     }
 }
 
-/// What a photo's pixels weigh.
+/// Sum and number of a photo's weights.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Weight {
     /// Sum of the weights.
@@ -77,8 +76,7 @@ impl Weight {
         }
     }
 
-    /// What one channel of a pixel of weight 1 counts in the loss, a mean; 0 where the photo is
-    /// masked out everywhere and asks for nothing.
+    /// Weight of one channel of a pixel of weight 1 in the loss; 0 if all is masked out.
     pub(crate) fn scale(&self) -> f64 {
         if self.count > 0.0 { 1.0 / (3.0 * self.count) } else { 0.0 }
     }
@@ -91,10 +89,22 @@ impl Weight {
 }
 
 impl Target {
+    /// A photo without weights, depths or a known background, in every round until the end.
+    pub fn new(width: u32, height: u32, channels: u32, pixels: Vec<u8>) -> Self {
+        Self {
+            width,
+            height,
+            channels,
+            pixels,
+            weights: None,
+            depth: None,
+            background: None,
+            turns: 1,
+            until: None,
+        }
+    }
+
     /// Checks sizes and values; `index` names the photo in the error.
-    ///
-    /// # Errors
-    /// [`Error::Argument`] that names `images[index]`.
     pub fn validate(&self, index: usize) -> Result<()> {
         let pixels = self.width as usize * self.height as usize;
         let bad = |reason: String| Err(Error::argument(format!("images[{index}]"), reason));
@@ -108,7 +118,7 @@ impl Target {
             return bad("does not hold width x height pixels".into());
         }
         if self.background.is_some_and(|color| color.iter().any(|c| !(0.0..=1.0).contains(c))) {
-            return bad("has a background that does not lie in 0..=1".into());
+            return bad("has a background outside of 0..=1".into());
         }
         if self.turns == 0 {
             return bad("has no turn; give at least one".into());
@@ -133,10 +143,10 @@ impl Target {
         self.weights.as_deref().map_or(Weight { sum: pixels, count: pixels }, Weight::of)
     }
 
-    /// The photo with each `by` x `by` pixels averaged into one; rows and columns left over are dropped.
+    /// The photo with each `by` x `by` pixels averaged into one; leftover rows and columns are dropped.
     ///
-    /// Colours are weighted by alpha and by the weights, which are averaged themselves. The depth is
-    /// that of a pixel in the middle: a mean over an edge is on no surface.
+    /// Colors are weighted by alpha and by the weights, which are averaged too. The depth is taken from a
+    /// pixel in the middle: a mean over an edge is on no surface.
     pub fn reduced(&self, by: u32) -> Self {
         let (width, height) = (self.width / by, self.height / by);
         let (side, channels) = (by as usize, self.channels as usize);
@@ -236,7 +246,7 @@ mod tests {
     }
 
     #[test]
-    fn a_reduced_photo_has_the_mean_of_what_counts() {
+    fn a_reduced_photo_has_weighted_means() {
         let plain = photo(3, (0..18).map(|i| 10 * i as u8).collect(), None).reduced(2);
         assert_eq!((plain.width, plain.height, plain.turns, plain.until), (1, 1, 2, Some(7)));
         // Pixels 0, 1, 3 and 4; the last column is left over.
@@ -247,7 +257,7 @@ mod tests {
         pixels[12..16].copy_from_slice(&[40, 100, 50, 255]);
         let weights = vec![1.0, 1.0, 0.0, 1.0, 0.0, 0.0];
         let clear = photo(4, pixels, Some(weights)).reduced(2);
-        // Neither the transparent pixel's colour counts nor that of the one of weight 0.
+        // The transparent pixel and the one of weight 0 do not contribute colors.
         assert_eq!(clear.pixels, [20, 100, 50, 170]);
         assert_eq!(clear.weights, Some(vec![0.75]));
         clear.validate(0).unwrap();

@@ -1,15 +1,16 @@
 //! Whole fits on the CPU, density control included: the same seed gives the same bits, on any
 //! number of threads and across an interruption.
 
+#[macro_use]
 mod common;
 
-use common::{random_camera, random_scene, rng};
+use common::{on_threads, random_camera, random_scene, render, rng};
 use splat_render::cpu::{Cpu, CpuFit};
 use splat_render::fit::{
     Background, CameraConfig, CameraState, DensityControl, Exposure, FitConfig, FitDevice,
-    FitState, Fitter, Focal, Rates, StepInput, Target, TargetDepth, splats_from_points,
+    FitState, Fitter, Focal, StepInput, Target, TargetDepth, splats_from_points,
 };
-use splat_render::{Camera, Error, ProjectOptions, Stages};
+use splat_render::{Camera, Error, Stages};
 
 const STEPS: u32 = 420;
 
@@ -21,25 +22,13 @@ fn photos() -> (Vec<Target>, Vec<Camera>) {
     let targets = cameras
         .iter()
         .map(|camera| {
-            let projected =
-                Cpu.project(&scene.params(), camera, &ProjectOptions::default()).unwrap();
-            let image = Cpu.rasterize(&projected, [0.0; 3]).unwrap();
+            let image = render(&Cpu, &scene.params(), camera, [0.0; 3]);
             let byte = |v: f32| (v * 255.0).round().clamp(0.0, 255.0) as u8;
             let pixels = image.color.iter().zip(&image.alpha).flat_map(|(c, &a)| {
                 let straight = c.map(|c| byte(c / a.max(1e-6)));
                 [straight[0], straight[1], straight[2], byte(a)]
             });
-            Target {
-                width: 40,
-                height: 30,
-                channels: 4,
-                pixels: pixels.collect(),
-                weights: None,
-                depth: None,
-                background: None,
-                turns: 1,
-                until: None,
-            }
+            Target::new(40, 30, 4, pixels.collect())
         })
         .collect();
     (targets, cameras)
@@ -55,7 +44,6 @@ fn config(density: DensityControl) -> FitConfig {
         density,
         background: Background::Random,
         dropout: 0.2,
-        hull: true,
         cameras: Some(CameraConfig { focal: Focal::Shared, ..CameraConfig::default() }),
         ..FitConfig::default()
     }
@@ -66,10 +54,19 @@ fn start(seed: u64) -> FitState {
     FitState::new(splats_from_points(&points, &vec![[0.5; 3]; points.len()], 1).unwrap())
 }
 
+fn on_cpu(
+    targets: Vec<Target>,
+    cameras: Vec<Camera>,
+    state: FitState,
+    step: u32,
+    config: FitConfig,
+) -> Fitter {
+    Fitter::new(Box::new(CpuFit::default()), targets, cameras, state, step, config).unwrap()
+}
+
 fn fitter(density: DensityControl, state: &FitState, step: u32) -> Fitter {
     let (targets, cameras) = photos();
-    let device = Box::new(CpuFit::default());
-    Fitter::new(device, targets, cameras, state.clone(), step, config(density)).unwrap()
+    on_cpu(targets, cameras, state.clone(), step, config(density))
 }
 
 fn run(fitter: &mut Fitter, until: u32) -> FitState {
@@ -97,10 +94,7 @@ fn the_loss_falls_and_density_control_runs() {
 #[test]
 fn the_same_seed_gives_the_same_bits_on_any_number_of_threads() {
     for density in [DensityControl::Mcmc, DensityControl::Original] {
-        let on = |threads: usize| {
-            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            pool.install(|| run(&mut fitter(density, &start(1), 0), STEPS))
-        };
+        let on = |threads| on_threads(threads, || run(&mut fitter(density, &start(1), 0), STEPS));
         let one = on(1);
         for threads in [1, 2, 3, 8] {
             assert!(on(threads) == one, "{density:?}: {threads} threads give other bits");
@@ -126,8 +120,7 @@ fn a_fit_leaves_frozen_splats_as_they_are_and_resumes() {
         assert_eq!(fitter.splat_count(), end.splats.len() - 40);
         assert!(fitter.splat_count() != 110 && fitter.splat_count() <= 260);
         let (targets, photos) = photos();
-        let device = Box::new(CpuFit::default());
-        let mut resumed = Fitter::new(device, targets, photos, cut, 310, config(density)).unwrap();
+        let mut resumed = on_cpu(targets, photos, cut, 310, config(density));
         resumed.resume_cameras(cameras).unwrap();
         assert!(run(&mut resumed, STEPS) == end, "{density:?} resumed ends otherwise");
     }
@@ -155,7 +148,7 @@ fn a_resumed_fit_ends_with_the_same_bits() {
 }
 
 #[test]
-fn a_fit_from_coarse_to_fine_resumes_with_the_same_bits_and_moves_cameras_as_a_whole_one_does() {
+fn a_fit_from_coarse_to_fine_resumes_with_the_same_bits() {
     // Photos of noise that is smooth enough for half the size to show it.
     let (small, cameras) = photos();
     let targets: Vec<Target> = small
@@ -183,14 +176,8 @@ fn a_fit_from_coarse_to_fine_resumes_with_the_same_bits_and_moves_cameras_as_a_w
         .collect();
     let steps = 100;
     let coarse = |state: FitState, step| {
-        let config = FitConfig {
-            steps,
-            coarse_to_fine: true,
-            hull: false,
-            ..config(DensityControl::Original)
-        };
-        let device = Box::new(CpuFit::default());
-        Fitter::new(device, targets.clone(), cameras.clone(), state, step, config).unwrap()
+        let config = FitConfig { steps, coarse_to_fine: true, ..config(DensityControl::Original) };
+        on_cpu(targets.clone(), cameras.clone(), state, step, config)
     };
     let mut whole = coarse(start(1), 0);
     run(&mut whole, 31);
@@ -211,11 +198,11 @@ fn a_fit_from_coarse_to_fine_resumes_with_the_same_bits_and_moves_cameras_as_a_w
 }
 
 #[test]
-fn a_photo_of_two_turns_is_fitted_as_often_as_two_photos() {
+fn a_photo_with_two_turns_counts_as_two_photos() {
     let (targets, cameras) = photos();
     let fitted = |turns: &[(usize, u32)]| {
         let targets = turns.iter().map(|&(k, turns)| Target { turns, ..targets[k].clone() });
-        // All of one camera: how far the scene reaches goes by the cameras that there are.
+        // One camera for all, because the scene's extent depends on the cameras.
         let cameras = vec![cameras[0]; turns.len()];
         let config = FitConfig { cameras: None, ..config(DensityControl::Mcmc) };
         let device = Box::new(CpuFit::default());
@@ -230,7 +217,7 @@ fn a_photo_of_two_turns_is_fitted_as_often_as_two_photos() {
 }
 
 #[test]
-fn a_photo_that_leaves_is_fitted_no_more() {
+fn a_photo_counts_until_its_last_step() {
     let (targets, cameras) = photos();
     let config = FitConfig { cameras: None, ..config(DensityControl::Mcmc) };
     let fitter = |until: &[Option<u32>], state: &FitState, step: u32| {
@@ -246,53 +233,50 @@ fn a_photo_that_leaves_is_fitted_no_more() {
     assert!(fitted(&leaving, 10) == fitted(&all, 10));
     let whole = fitted(&leaving, 30);
     assert!(whole != fitted(&all, 30));
-    // From then on it is a fit to the one that stays, whatever the others show; in rounds of one.
+    // From then on it is a fit to the remaining photo.
     let half = fitted(&all, 10);
     let gone = [None, Some(0), Some(0), Some(0), Some(0)];
     assert!(run(&mut fitter(&gone, &half, 10).unwrap(), 30) == whole);
-    // Also where it is resumed in the middle of either part.
+    // Also if resumed in the middle of either part.
     for cut in [4, 10, 17] {
         let mut resumed = fitter(&leaving, &fitted(&leaving, cut), cut).unwrap();
         assert!(run(&mut resumed, 30) == whole, "resumed at step {cut} it ends otherwise");
     }
     let none = fitter(&[Some(10); 5], &start(1), 0).err().unwrap().to_string();
-    assert!(none.contains("images: has none that is fitted to until the end"), "{none}");
+    assert!(none.contains("images: has none that is fitted until the end"), "{none}");
 }
 
-/// One step that changes no splat, and what it says of its camera.
+/// One step that changes no splat.
 fn still_step(device: &mut CpuFit, camera: Camera, step: u32) -> StepInput {
     let input = StepInput {
-        view: 0,
-        camera,
         background: [0.2, 0.5, 0.7],
         sh_degree: 1,
-        rates: Rates::ZERO,
         step,
-        ssim_weight: 0.2,
-        opacity_regularizer: 0.0,
-        scale_regularizer: 0.0,
-        noise: 0.0,
         dropout: 0.2,
         noise_seed: 3,
         camera_gradient: true,
-        exposure: None,
-        depth_weight: 0.0,
+        ..StepInput::new(0, camera)
     };
     device.step(&input).unwrap();
     input
 }
 
+/// A fit whose loss is smooth: large splats, far from the photos' colors.
+fn smooth(targets: Vec<Target>) -> (CpuFit, FitState) {
+    let mut state = start(1);
+    state.splats.scales.as_flattened_mut().iter_mut().for_each(|v| *v += 1.5);
+    state.splats.opacities.fill(-1.0);
+    state.splats.sh.as_flattened_mut().iter_mut().for_each(|v| *v += 0.3);
+    let mut device = CpuFit::default();
+    device.set_targets(targets).unwrap();
+    device.upload(state.clone()).unwrap();
+    (device, state)
+}
+
 #[test]
 fn the_camera_gradient_is_the_slope_of_the_loss() {
     let (targets, cameras) = photos();
-    let mut device = CpuFit::default();
-    device.set_targets(targets).unwrap();
-    let mut state = start(1);
-    // Smooth where the loss is probed: large splats, far from the photo's colours.
-    state.splats.scales.iter_mut().for_each(|s| *s = s.map(|v| v + 1.5));
-    state.splats.opacities.iter_mut().for_each(|o| *o = -1.0);
-    state.splats.sh.iter_mut().for_each(|c| *c = c.map(|v| v + 0.3));
-    device.upload(state.clone()).unwrap();
+    let (mut device, state) = smooth(targets);
     let camera = cameras[0];
     still_step(&mut device, camera, 1);
     let gradient = device.camera_gradients().unwrap()[0];
@@ -322,8 +306,7 @@ fn exposure_fitter(state: &FitState, step: u32) -> Fitter {
     let (targets, cameras) = photos();
     let start: Vec<_> = (0..targets.len()).map(|k| (k != 1).then(Exposure::none)).collect();
     let config = FitConfig { exposures: true, ..config(DensityControl::Mcmc) };
-    let device = Box::new(CpuFit::default());
-    let mut fitter = Fitter::new(device, targets, cameras, state.clone(), step, config).unwrap();
+    let mut fitter = on_cpu(targets, cameras, state.clone(), step, config);
     let pulls = vec![0.1; start.len()];
     fitter.start_exposures(&start, &pulls).unwrap();
     fitter
@@ -331,15 +314,11 @@ fn exposure_fitter(state: &FitState, step: u32) -> Fitter {
 
 #[test]
 fn exposures_have_the_same_bits_on_any_number_of_threads_and_after_a_resume() {
-    let on = |threads: usize| {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| {
-            let mut fitter = exposure_fitter(&start(1), 0);
-            (run(&mut fitter, 40), fitter.exposure_state().unwrap().unwrap())
-        })
-    };
-    let whole = on(1);
-    assert!(on(3) == whole, "the number of threads changed bits");
+    let end =
+        |mut fitter: Fitter| (run(&mut fitter, 40), fitter.exposure_state().unwrap().unwrap());
+    let [whole, threaded] =
+        [1, 3].map(|threads| on_threads(threads, || end(exposure_fitter(&start(1), 0))));
+    assert!(threaded == whole, "the number of threads changed bits");
     assert_ne!(whole.1.gains[0], [1.0; 3]);
     assert_eq!(whole.1.gains[1], [1.0; 3], "a photo without exposure got one");
     // Within a round, so that sums of gradients are under way.
@@ -347,31 +326,28 @@ fn exposures_have_the_same_bits_on_any_number_of_threads_and_after_a_resume() {
     let (state, exposures) = (run(&mut first, 23), first.exposure_state().unwrap().unwrap());
     let mut resumed = exposure_fitter(&state, 23);
     resumed.resume_exposures(exposures).unwrap();
-    let ended = (run(&mut resumed, 40), resumed.exposure_state().unwrap().unwrap());
-    assert!(ended == whole, "resumed it ends otherwise");
+    assert!(end(resumed) == whole, "resumed it ends otherwise");
     let plain = fitter(DensityControl::Mcmc, &start(1), 0).exposure_state().unwrap();
     assert!(plain.is_none(), "a fit without exposures has some");
 }
 
-/// A fit to photos of which all but one have depths, from splats that are on their way.
+/// A fit to photos with depths, except one.
 fn depth_fitter(weight: f32, state: &FitState, step: u32, cameras: Option<CameraConfig>) -> Fitter {
     let (mut targets, known) = photos();
     for (k, (target, depth)) in targets.iter_mut().zip(depths()).enumerate() {
         target.depth = (k != 1).then_some(depth);
     }
     let config = FitConfig { depth_weight: weight, cameras, ..config(DensityControl::Mcmc) };
-    let device = Box::new(CpuFit::default());
-    Fitter::new(device, targets, known, state.clone(), step, config).unwrap()
+    on_cpu(targets, known, state.clone(), step, config)
 }
 
-/// Depths of what [`photos`] show, where they are opaque.
+/// Depths of the photos' opaque pixels.
 fn depths() -> Vec<TargetDepth> {
     let mut rng = rng(11);
     let scene = random_scene(&mut rng, 80, Some(0));
     let depths_of = |_| {
         let camera = random_camera(&mut rng, 40, 30);
-        let projected = Cpu.project(&scene.params(), &camera, &ProjectOptions::default()).unwrap();
-        let image = Cpu.rasterize(&projected, [0.0; 3]).unwrap();
+        let image = render(&Cpu, &scene.params(), &camera, [0.0; 3]);
         TargetDepth {
             depths: image.depth.iter().zip(&image.alpha).map(|(d, a)| d / a.max(1e-6)).collect(),
             confidences: image.alpha.iter().map(|&a| if a > 0.8 { 1.0 } else { 0.0 }).collect(),
@@ -383,12 +359,10 @@ fn depths() -> Vec<TargetDepth> {
 #[test]
 fn depths_have_the_same_bits_on_any_number_of_threads_and_after_a_resume() {
     let joint = config(DensityControl::Mcmc).cameras;
-    let on = |threads: usize| {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| run(&mut depth_fitter(0.5, &start(1), 0, joint), 40))
-    };
-    let whole = on(1);
-    assert!(on(3) == whole, "the number of threads changed bits");
+    let [whole, threaded] = [1, 3].map(|threads| {
+        on_threads(threads, || run(&mut depth_fitter(0.5, &start(1), 0, joint), 40))
+    });
+    assert!(threaded == whole, "the number of threads changed bits");
     let mut first = depth_fitter(0.5, &start(1), 0, joint);
     let state = run(&mut first, 23);
     let mut resumed = depth_fitter(0.5, &state, 23, joint);
@@ -403,14 +377,11 @@ fn depths_have_the_same_bits_on_any_number_of_threads_and_after_a_resume() {
 }
 
 #[test]
-fn a_fit_comes_nearer_to_depths_by_them() {
+fn depths_make_a_fit_more_accurate() {
     let (_, cameras) = photos();
     let off = |state: &FitState| {
-        let splats = &state.splats;
         let loss = |(camera, depth): (&Camera, &TargetDepth)| {
-            let projected =
-                Cpu.project(&splats.params(1), camera, &ProjectOptions::default()).unwrap();
-            let image = Cpu.rasterize(&projected, [0.0; 3]).unwrap();
+            let image = render(&Cpu, &state.splats.params(1), camera, [0.0; 3]);
             Cpu.depth_loss(&image, depth).unwrap().value
         };
         cameras.iter().zip(&depths()).map(loss).sum::<f32>() / 5.0
@@ -433,13 +404,7 @@ fn the_exposure_gradient_is_the_slope_of_the_loss() {
         })
         .collect();
     for (targets, background) in [(plain, None), (matted, Some([0.2, 0.5, 0.7]))] {
-        let mut device = CpuFit::default();
-        device.set_targets(targets).unwrap();
-        let mut state = start(1);
-        state.splats.scales.iter_mut().for_each(|s| *s = s.map(|v| v + 1.5));
-        state.splats.opacities.iter_mut().for_each(|o| *o = -1.0);
-        state.splats.sh.iter_mut().for_each(|c| *c = c.map(|v| v + 0.3));
-        device.upload(state.clone()).unwrap();
+        let (mut device, _) = smooth(targets);
         let camera = cameras[0];
         let exposure = Exposure { gain: [1.3, 0.8, 1.1], offset: [0.05, -0.02, 0.1], background };
         let input = still_step(&mut device, camera, 1);
@@ -451,36 +416,30 @@ fn the_exposure_gradient_is_the_slope_of_the_loss() {
             (f64::from(device.loss().unwrap()), exposures[0], camera)
         };
         let (_, gradient, v_camera) = step(exposure, camera);
-        let largest = gradient.v_gain.iter().fold(0.0f64, |a, v| a.max(v.abs()));
-        for c in 0..3 {
-            let mut at = |by: f32| {
-                let mut moved = exposure;
-                moved.gain[c] += by;
-                step(moved, camera).0
-            };
-            let slope = (at(2e-3) - at(-2e-3)) / 4e-3;
-            let off = (slope - gradient.v_gain[c]).abs();
-            assert!(off < 0.03 * largest, "gain {c}: {slope} for {}", gradient.v_gain[c]);
-            let mut at = |by: f32| {
-                let mut moved = exposure;
-                moved.offset[c] += by;
-                step(moved, camera).0
-            };
-            let slope = (at(2e-3) - at(-2e-3)) / 4e-3;
-            let off = (slope - gradient.v_offset[c]).abs();
-            assert!(off < 0.03 * largest, "offset {c}: {slope} for {}", gradient.v_offset[c]);
-        }
-        // What lies before the exposure gets its gradient through it, alpha's part included.
-        let largest = v_camera.v_viewmat.iter().map(|row| row[3].abs()).fold(0.0, f64::max);
-        for axis in 0..3 {
-            let mut at = |by: f64| {
-                let mut moved = camera;
-                moved.viewmat.w_axis[axis] += by;
-                step(exposure, moved).0
-            };
-            let slope = (at(2e-3) - at(-2e-3)) / 4e-3;
-            let expected = v_camera.v_viewmat[axis][3];
-            assert!((slope - expected).abs() < 0.03 * largest, "{axis}: {slope} for {expected}");
+        let shift = v_camera.v_viewmat.map(|row| row[3]);
+        let largest = |row: &[f64]| row.iter().fold(0.0f64, |a, v| a.max(v.abs()));
+        type Change = fn(&mut Exposure<f32>, &mut Camera, usize, f64);
+        let changes: [(&str, f64, [f64; 3], Change); 3] = [
+            ("gain", largest(&gradient.v_gain), gradient.v_gain, |e, _, k, by| {
+                e.gain[k] += by as f32
+            }),
+            ("offset", largest(&gradient.v_gain), gradient.v_offset, |e, _, k, by| {
+                e.offset[k] += by as f32
+            }),
+            // The camera's gradient passes through the exposure, including alpha's part.
+            ("shift", largest(&shift), shift, |_, camera, k, by| camera.viewmat.w_axis[k] += by),
+        ];
+        for (name, largest, gradient, change) in changes {
+            for (k, expected) in gradient.into_iter().enumerate() {
+                let mut at = |by: f64| {
+                    let (mut exposure, mut camera) = (exposure, camera);
+                    change(&mut exposure, &mut camera, k, by);
+                    step(exposure, camera).0
+                };
+                let slope = (at(2e-3) - at(-2e-3)) / 4e-3;
+                let off = (slope - expected).abs();
+                assert!(off < 0.03 * largest, "{name} {k}: {slope} for {expected}");
+            }
         }
     }
 }
@@ -489,8 +448,7 @@ fn the_exposure_gradient_is_the_slope_of_the_loss() {
 fn another_seed_gives_other_bits() {
     let (targets, cameras) = photos();
     let other = FitConfig { seed: 6, ..config(DensityControl::Mcmc) };
-    let device = Box::new(CpuFit::default());
-    let mut other = Fitter::new(device, targets, cameras, start(1), 0, other).unwrap();
+    let mut other = on_cpu(targets, cameras, start(1), 0, other);
     let mut one = fitter(DensityControl::Mcmc, &start(1), 0);
     assert!(run(&mut other, 20) != run(&mut one, 20));
 }
@@ -501,9 +459,7 @@ fn a_fit_that_enters_the_schedule_late_takes_a_first_step() {
         let (targets, cameras) = photos();
         let state = start(1);
         let config = FitConfig { first_step, ..config(DensityControl::Mcmc) };
-        let device = Box::new(CpuFit::default());
-        let mut fitter =
-            Fitter::new(device, targets, cameras, state.clone(), first_step, config).unwrap();
+        let mut fitter = on_cpu(targets, cameras, state.clone(), first_step, config);
         let after = run(&mut fitter, first_step + 1);
         let pairs = after.splats.opacities.iter().zip(&state.splats.opacities);
         pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
@@ -520,9 +476,8 @@ fn pixels_of_half_the_weight_count_half() {
         for target in &mut targets {
             target.weights = weight.map(|w| vec![w; target.pixels.len() / 4]);
         }
-        let config = FitConfig { hull: false, ..config(DensityControl::Mcmc) };
-        let device = Box::new(CpuFit::default());
-        let mut fitter = Fitter::new(device, targets, cameras, start(1), 0, config).unwrap();
+        let config = config(DensityControl::Mcmc);
+        let mut fitter = on_cpu(targets, cameras, start(1), 0, config);
         fitter.step().unwrap();
         fitter.loss().unwrap()
     };
@@ -534,53 +489,27 @@ fn pixels_of_half_the_weight_count_half() {
 
 #[test]
 fn bad_arguments_are_named() {
-    let (targets, cameras) = photos();
-    let build = |targets: Vec<Target>, cameras: Vec<Camera>, state: &FitState, config| {
+    type Change = fn(&mut Vec<Target>, &mut Vec<Camera>, &mut FitConfig);
+    let changes: [(&str, Change); 10] = [
+        ("images: ", |targets, cameras, _| (targets.clear(), cameras.clear()).0),
+        ("viewmats", |_, cameras, _| cameras.truncate(4)),
+        ("images[2]", |targets, _, _| targets[2].pixels.truncate(4)),
+        ("images[1]", |targets, _, _| targets[1].weights = Some(vec![f32::NAN; 1200])),
+        ("viewmat", |_, cameras, _| cameras[0].viewmat.x_axis.x += 0.5),
+        ("K", |_, cameras, _| cameras[0].fx = 0.0),
+        ("steps", |_, _, config| config.steps = 0),
+        ("first_step", |_, _, config| config.first_step = 1000),
+        ("step", |_, _, config| config.first_step = 10),
+        ("SH degree", |_, _, config| config.sh_degree = 2),
+    ];
+    for (name, change) in changes {
+        let ((mut targets, mut cameras), mut config) = (photos(), config(DensityControl::Mcmc));
+        change(&mut targets, &mut cameras, &mut config);
         let device = Box::new(CpuFit::default());
-        let error = Fitter::new(device, targets, cameras, state.clone(), 0, config).err();
-        error.as_ref().map_or_else(String::new, Error::to_string)
-    };
-    let good = config(DensityControl::Mcmc);
-    let state = start(1);
-    assert!(build(vec![], vec![], &state, good.clone()).contains("images"));
-    assert!(
-        build(targets.clone(), cameras[1..].to_vec(), &state, good.clone()).contains("viewmats")
-    );
-    let mut small = targets.clone();
-    small[2].pixels.pop();
-    assert!(build(small, cameras.clone(), &state, good.clone()).contains("images[2]"));
-    let mut weights = targets.clone();
-    weights[1].weights = Some(vec![f32::NAN; 1200]);
-    assert!(build(weights, cameras.clone(), &state, good.clone()).contains("images[1]"));
-    let mut skewed = cameras.clone();
-    skewed[0].viewmat.x_axis.x += 0.5;
-    assert!(build(targets.clone(), skewed, &state, good.clone()).contains("viewmat"));
-    let mut flat = cameras.clone();
-    flat[0].fx = 0.0;
-    assert!(build(targets.clone(), flat, &state, good.clone()).contains("K"));
-    let none = FitConfig { steps: 0, ..good.clone() };
-    assert!(build(targets.clone(), cameras.clone(), &state, none).contains("steps"));
-    let late = FitConfig { first_step: 1000, ..good.clone() };
-    assert!(build(targets.clone(), cameras.clone(), &state, late).contains("first_step"));
-    let before = FitConfig { first_step: 10, ..good.clone() };
-    assert!(build(targets.clone(), cameras.clone(), &state, before).contains("step"));
-    let degree = FitConfig { sh_degree: 2, ..good };
-    assert!(build(targets, cameras, &state, degree).contains("SH degree"));
-}
-
-#[test]
-fn frozen_steps_keep_the_moments() {
-    common::agreement::frozen_steps_keep_the_moments(&mut CpuFit::default());
-}
-
-#[test]
-fn the_last_splats_stay() {
-    common::agreement::the_last_splats_stay(&mut CpuFit::default());
-}
-
-#[test]
-fn senseless_steps_are_refused() {
-    common::agreement::senseless_steps_are_refused(&mut CpuFit::default());
+        let error = Fitter::new(device, targets, cameras, start(1), 0, config).err();
+        let error = error.as_ref().map_or_else(String::new, Error::to_string);
+        assert!(error.contains(name), "{name}: {error}");
+    }
 }
 
 #[test]
@@ -596,7 +525,7 @@ fn a_whole_fit_whose_colors_wait_ends_with_the_same_bits() {
             let (targets, cameras) = photos();
             // Each camera sees a part of the scene.
             let cameras = cameras.iter().map(|c| Camera { fx: 3.0 * c.fx, fy: 3.0 * c.fy, ..*c });
-            let config = FitConfig { hull: false, ..config(density) };
+            let config = config(density);
             let device = Box::new(device);
             let mut fitter =
                 Fitter::new(device, targets, cameras.collect(), start(1), 0, config).unwrap();
@@ -605,4 +534,11 @@ fn a_whole_fit_whose_colors_wait_ends_with_the_same_bits() {
         let dense = end(CpuFit::default().with_color_wait(1));
         assert!(end(CpuFit::default()) == dense, "{density:?}: waiting changed bits");
     }
+}
+
+checks! {
+    [&mut CpuFit::default()];
+    agreement::frozen_steps_keep_the_moments();
+    agreement::the_last_splats_stay();
+    agreement::invalid_steps_are_refused();
 }

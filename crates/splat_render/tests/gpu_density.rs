@@ -10,27 +10,18 @@ use glam::DMat4;
 use rand::Rng;
 use splat_render::Camera;
 use splat_render::cpu::CpuFit;
-use splat_render::fit::{FitDevice, FitState, McmcRun, OriginalRun, SplatArrays};
+use splat_render::fit::{FitDevice, FitState, McmcRun, OriginalRun};
 use splat_render::gpu::{Gpu, GpuFit};
 
 fn gpu() -> Gpu {
     Gpu::new(true).unwrap_or_else(|e| panic!("{e}"))
 }
 
-/// Splats of which some are dead, some fog and some not finite, amid a fit.
+/// A state in the middle of a fit, with dead, foggy and invalid splats.
 fn amid_a_fit(seed: u64, splats: usize, sh_degree: u32) -> FitState {
     let mut rng = rng(seed);
-    let [params, first, second] = [(); 3].map(|()| {
-        let scene = random_scene(&mut rng, splats, Some(sh_degree));
-        SplatArrays {
-            means: scene.means,
-            quats: scene.quats,
-            scales: scene.scales,
-            opacities: scene.opacities,
-            sh: scene.colors,
-            sh_degree: scene.sh_degree,
-        }
-    });
+    let [params, first, second] =
+        [(); 3].map(|()| random_scene(&mut rng, splats, Some(sh_degree)).arrays());
     let mut state = FitState { first, second, ..FitState::new(params) };
     let stride = state.splats.stride();
     for i in 0..splats {
@@ -52,15 +43,35 @@ fn cameras(seed: u64) -> Vec<Camera> {
     (0..4).map(|_| random_camera(&mut rng, 90, 60)).collect()
 }
 
-/// A name, and what is made of the adapter.
+/// A name, and a change of the adapter.
 type Way = (&'static str, fn(Gpu) -> Gpu);
 
-fn after(device: &mut dyn FitDevice, state: &FitState, run: &McmcRun) -> FitState {
-    device.upload(state.clone()).unwrap();
-    let splats = device.mcmc(run).unwrap();
-    let state = device.download().unwrap();
-    assert_eq!(state.splats.len(), splats);
-    state
+/// The state after a change on the host, checked against the GPU's. The change returns the number of
+/// moving splats.
+fn same(
+    gpu: &Arc<Gpu>,
+    state: &FitState,
+    change: impl Fn(&mut dyn FitDevice) -> splat_render::Result<usize>,
+) -> FitState {
+    let after = |device: &mut dyn FitDevice| {
+        device.upload(state.clone()).unwrap();
+        let moving = change(device).unwrap();
+        let after = device.download().unwrap();
+        assert_eq!(after.moving(), moving);
+        after
+    };
+    let expected = after(&mut CpuFit::default());
+    let got = after(&mut GpuFit::new(Arc::clone(gpu)));
+    assert!(got == expected, "{} splats: other bits", state.splats.len());
+    expected
+}
+
+fn same_after(gpu: &Arc<Gpu>, state: &FitState, run: &McmcRun) -> FitState {
+    same(gpu, state, |device| device.mcmc(run))
+}
+
+fn same_after_original(gpu: &Arc<Gpu>, state: &FitState, run: &OriginalRun) -> FitState {
+    same(gpu, state, |device| device.original(run))
 }
 
 const WAYS: [Way; 4] = [
@@ -71,76 +82,69 @@ const WAYS: [Way; 4] = [
 ];
 
 #[test]
-fn it_gives_the_bits_of_the_host() {
+fn mcmc_gives_the_bits_of_the_host() {
     for (way, of) in WAYS {
+        println!("{way}");
         let gpu = Arc::new(of(gpu()));
         for (k, (splats, target)) in
             [(1, 4), (150, 150), (700, 100), (900, 2000), (20_000, 21_000)].into_iter().enumerate()
         {
             let state = amid_a_fit(k as u64, splats, k as u32 % 4);
             let run = McmcRun { cameras: cameras(k as u64), target, seed: 77 + k as u32 };
-            let expected = after(&mut CpuFit::default(), &state, &run);
-            let got = after(&mut GpuFit::new(Arc::clone(&gpu)), &state, &run);
-            assert!(got == expected, "{way}, {splats} splats to {target}: other bits");
-            assert!(splats < 100 || got != state, "nothing was done");
+            let after = same_after(&gpu, &state, &run);
+            assert!(splats < 100 || after != state, "nothing was done");
         }
     }
 }
 
 #[test]
-fn where_all_are_dead_it_leaves_them() {
+fn mcmc_leaves_dead_scenes_as_they_are() {
     let mut state = amid_a_fit(1, 300, 1);
     state.splats.opacities.fill(-8.0);
     state.splats.means.fill([0.5; 3]);
     state.splats.sh.fill([0.1; 3]);
     let run = McmcRun { cameras: Vec::new(), target: 400, seed: 1 };
-    let expected = after(&mut CpuFit::default(), &state, &run);
-    let got = after(&mut GpuFit::new(Arc::new(gpu())), &state, &run);
-    assert_eq!(got.splats.len(), 300);
-    assert!(got == expected);
+    assert_eq!(same_after(&Arc::new(gpu()), &state, &run).splats.len(), 300);
 }
 
-/// What does not fit one binding is done on the host.
+/// Arrays larger than a binding are processed on the host.
 #[test]
 fn arrays_larger_than_a_binding_give_the_same() {
     let state = amid_a_fit(3, 2000, 2);
     let run = McmcRun { cameras: cameras(3), target: 2500, seed: 5 };
-    let expected = after(&mut CpuFit::default(), &state, &run);
     let small = Arc::new(gpu().with_binding_limit(200_000));
     let before = small.host_bytes();
-    let got = after(&mut GpuFit::new(Arc::clone(&small)), &state, &run);
-    assert!(got == expected);
+    same_after(&small, &state, &run);
     assert!(
         small.host_bytes() - before > 4 * 2000 * 3 * (11 + 27) * 2,
         "it was not done on the host"
     );
 }
 
-#[test]
-fn little_goes_between_host_and_device() {
+/// Bytes between host and device in changes of 20 000, 40 000 and 40 000 splats.
+fn host_bytes(change: impl Fn(&mut GpuFit, usize)) -> [u64; 3] {
     let gpu = Arc::new(gpu());
-    let mut traffic = Vec::new();
-    for splats in [20_000, 40_000, 40_000] {
+    let traffic = [20_000, 40_000, 40_000].map(|splats| {
         let mut fit = GpuFit::new(Arc::clone(&gpu));
         fit.upload(amid_a_fit(2, splats, 1)).unwrap();
         let before = gpu.host_bytes();
+        change(&mut fit, splats);
+        gpu.host_bytes() - before
+    });
+    println!("bytes of each run: {traffic:?}");
+    traffic
+}
+
+#[test]
+fn mcmc_has_little_host_traffic() {
+    let traffic = host_bytes(|fit, splats| {
         let run = McmcRun { cameras: cameras(2), target: splats + 2000, seed: 3 };
         fit.mcmc(&run).unwrap();
-        traffic.push(gpu.host_bytes() - before);
-    }
-    println!("bytes of each run: {traffic:?}");
-    // A sample of at most 10 000 centres, and tables: no more for more splats.
+    });
+    // A sample of at most 10 000 centers, and tables: no more for more splats.
     assert_eq!(traffic[1], traffic[2]);
     assert!(traffic[0].abs_diff(traffic[1]) < 1000, "{traffic:?}");
     assert!(traffic[0] < 1_000_000, "{traffic:?}");
-}
-
-fn after_original(device: &mut dyn FitDevice, state: &FitState, run: &OriginalRun) -> FitState {
-    device.upload(state.clone()).unwrap();
-    let splats = device.original(run).unwrap();
-    let state = device.download().unwrap();
-    assert_eq!(state.moving(), splats);
-    state
 }
 
 fn original_run(max_splats: usize, extent: f32) -> OriginalRun {
@@ -155,14 +159,6 @@ fn sound(mut state: FitState) -> FitState {
         *v = 0.1;
     }
     state
-}
-
-/// What the host makes of a state, after the GPU has been seen to make the same of it.
-fn same_after_original(gpu: &Arc<Gpu>, state: &FitState, run: &OriginalRun) -> FitState {
-    let expected = after_original(&mut CpuFit::default(), state, run);
-    let got = after_original(&mut GpuFit::new(Arc::clone(gpu)), state, run);
-    assert!(got == expected, "{} splats, {run:?}: other bits", state.splats.len());
-    expected
 }
 
 #[test]
@@ -189,7 +185,7 @@ fn clones_splits_and_prunes_have_the_bits_of_the_host() {
 }
 
 #[test]
-fn where_the_original_control_has_nothing_to_do_it_does_nothing_but_order() {
+fn original_control_without_work_only_sorts() {
     let gpu = Arc::new(gpu());
     let mut state = sound(amid_a_fit(4, 300, 1));
     state.splats.opacities.fill(1.0);
@@ -198,7 +194,7 @@ fn where_the_original_control_has_nothing_to_do_it_does_nothing_but_order() {
         means.sort_by(|a, b| a.partial_cmp(b).unwrap());
         means
     };
-    // No gradient; never seen, where a gradient counts as that of one step; and at the cap or above.
+    // No gradient; never seen (a gradient counts as one step's); and at the cap or above.
     let mut still = state.clone();
     still.stats.grad_sum.fill(0.0);
     let mut unseen = state.clone();
@@ -212,7 +208,7 @@ fn where_the_original_control_has_nothing_to_do_it_does_nothing_but_order() {
     unseen.stats.grad_sum.fill(2.1e-4);
     let after = same_after_original(&gpu, &unseen, &original_run(900, 1e9));
     assert_eq!(after.splats.len(), 600);
-    // Of statistics that are no numbers nothing grows.
+    // Invalid statistics make nothing grow.
     let mut odd = state.clone();
     odd.stats.grad_sum = [f32::NAN, f32::INFINITY, -1.0].repeat(100);
     assert_eq!(same_after_original(&gpu, &odd, &original_run(900, 1.0)).splats.len(), 300);
@@ -222,12 +218,12 @@ fn where_the_original_control_has_nothing_to_do_it_does_nothing_but_order() {
 }
 
 #[test]
-fn where_all_would_be_pruned_all_stay() {
+fn if_all_would_be_pruned_all_stay() {
     let gpu = Arc::new(gpu());
     let mut state = sound(amid_a_fit(1, 300, 1));
     state.splats.opacities.fill(-8.0);
     let run = original_run(310, 1.0);
-    // Those that grow do so.
+    // The right number of splats grows.
     assert_eq!(same_after_original(&gpu, &state, &run).splats.len(), 310);
     state.splats.opacities.fill(1.0);
     state.splats.scales.fill([2.0; 3]);
@@ -236,7 +232,7 @@ fn where_all_would_be_pruned_all_stay() {
 }
 
 #[test]
-fn halves_that_would_leave_the_numbers_stay_where_they_are() {
+fn halves_beyond_the_range_of_numbers_stay_in_place() {
     let mut state = amid_a_fit(6, 200, 0);
     state.stats.grad_sum.fill(1.0);
     state.splats.means.fill([3.4e38; 3]);
@@ -247,9 +243,9 @@ fn halves_that_would_leave_the_numbers_stay_where_they_are() {
     assert!(after.splats.len() > 300);
 }
 
-/// Rotations of every length, numbers that a driver may flush, and those that leave the range in between.
+/// Rotations of every length, numbers that a driver may flush, and intermediate overflow.
 #[test]
-fn halves_of_splats_with_extreme_numbers_lie_where_the_host_has_them() {
+fn halves_of_splats_with_extreme_numbers_are_the_host_s() {
     let mut rng = rng(8);
     let n = 6000;
     let mut state = sound(amid_a_fit(8, n, 0));
@@ -277,9 +273,9 @@ fn halves_of_splats_with_extreme_numbers_lie_where_the_host_has_them() {
     assert!(still > n / 10 && still < n, "{still} halves lie where their splat lay");
 }
 
-/// Splats that reach to the edge of a picture and not a bit further: rounding alone tells which are fog.
+/// Splats that end exactly at a picture's edge: rounding decides which are fog.
 #[test]
-fn fog_on_the_edge_of_a_picture_is_told_as_on_the_host() {
+fn fog_at_the_edge_of_a_picture_is_found_as_on_the_host() {
     let mut rng = rng(9);
     let n = 5000;
     let camera = Camera {
@@ -295,7 +291,7 @@ fn fog_on_the_edge_of_a_picture_is_told_as_on_the_host() {
     state.splats.opacities.fill(0.0);
     let back = camera.viewmat.inverse();
     for i in 0..n {
-        // A wall behind, before it those in question.
+        // A wall, and test splats in front of it.
         let wall = i % 10 == 0;
         let scale = if wall { -3.0 } else { rng.random_range(-2.5..0.0) };
         let [y, depth] = [rng.random_range(-0.3..0.3), rng.random_range(0.5..1.5)];
@@ -305,9 +301,7 @@ fn fog_on_the_edge_of_a_picture_is_told_as_on_the_host() {
         state.splats.scales[i] = [scale, -9.0, -9.0];
     }
     let run = McmcRun { cameras: vec![camera], target: n, seed: 1 };
-    let expected = after(&mut CpuFit::default(), &state, &run);
-    let got = after(&mut GpuFit::new(Arc::new(gpu())), &state, &run);
-    assert!(got == expected, "other bits");
+    let expected = same_after(&Arc::new(gpu()), &state, &run);
     let left: HashSet<_> = expected.splats.means.iter().map(|m| m.map(f32::to_bits)).collect();
     let fog = state.splats.means.iter().filter(|m| !left.contains(&m.map(f32::to_bits))).count();
     assert!(fog > n / 4 && fog < n * 3 / 4, "{fog} of {n} are fog");
@@ -323,29 +317,22 @@ fn opacities_are_reset_as_on_the_host() {
         state.splats.sh.fill([0.1; 3]);
         state.splats.opacities[3] = f32::INFINITY;
         state.frozen = 300;
-        let [expected, got] =
-            [&mut CpuFit::default() as &mut dyn FitDevice, &mut GpuFit::new(Arc::clone(&gpu))].map(
-                |device| {
-                    device.upload(state.clone()).unwrap();
-                    device.reset_opacities().unwrap();
-                    device.download().unwrap()
-                },
-            );
-        assert!(got == expected, "{way}: other bits");
+        println!("{way}");
+        let expected = same(&gpu, &state, |device| device.reset_opacities().map(|()| 3700));
         assert!(expected.splats.opacities[..3700].iter().all(|&o| o < -4.59 || o.is_infinite()));
         assert!(expected.splats.opacities[3700..] == state.splats.opacities[3700..]);
     }
 }
 
-/// What does not fit one binding, and what is frozen, is done on the host.
+/// Arrays larger than a binding, and frozen splats, are processed on the host.
 #[test]
-fn what_the_device_does_not_take_is_the_same_by_the_host() {
+fn the_host_s_fallback_gives_the_same() {
     let state = amid_a_fit(3, 2000, 2);
     let small = Arc::new(gpu().with_binding_limit(200_000));
     let before = small.host_bytes();
     same_after_original(&small, &state, &original_run(2500, 1.0));
     assert!(small.host_bytes() - before > 4 * 2000 * 3 * (11 + 27) * 2, "not on the host");
-    // Those there are fit, those that there will be do not.
+    // The old scene fits, the new one does not.
     let tight = Arc::new(gpu().with_binding_limit(2000 * 27 * 4));
     same_after_original(&tight, &state, &original_run(4000, 1e-3));
     let frozen = FitState { frozen: 500, ..sound(state) };
@@ -353,19 +340,12 @@ fn what_the_device_does_not_take_is_the_same_by_the_host() {
 }
 
 #[test]
-fn little_of_the_original_control_goes_between_host_and_device() {
-    let gpu = Arc::new(gpu());
-    let mut traffic = Vec::new();
-    for splats in [20_000, 40_000, 40_000] {
-        let mut fit = GpuFit::new(Arc::clone(&gpu));
-        fit.upload(amid_a_fit(2, splats, 1)).unwrap();
-        let before = gpu.host_bytes();
+fn original_control_has_little_host_traffic() {
+    let traffic = host_bytes(|fit, splats| {
         let left = fit.original(&original_run(2 * splats, 1.0)).unwrap();
         fit.reset_opacities().unwrap();
         assert!(left > splats);
-        traffic.push(gpu.host_bytes() - before);
-    }
-    println!("bytes of each run: {traffic:?}");
+    });
     assert_eq!(traffic, [traffic[0]; 3], "it grows with the splats");
     assert!(traffic[0] < 10_000, "{traffic:?}");
 }

@@ -1,14 +1,11 @@
-//! What becomes of callers when an adapter fails: each fault is injected, and its message, what is kept
-//! and what works afterwards are looked at.
+//! Injected faults of an adapter: the error message, the state that is kept, and recovery.
 
 mod common;
 
 use std::sync::Arc;
 
 use common::*;
-use splat_render::fit::{
-    FitDevice, FitState, McmcRun, OriginalRun, Rates, SplatArrays, StepInput, Target,
-};
+use splat_render::fit::{FitDevice, FitState, McmcRun, OriginalRun, StepInput, Target};
 use splat_render::gpu::{Gpu, GpuFit, Injected, needed_limits};
 use splat_render::gpu_check::{open_tested_with, self_test};
 use splat_render::{Camera, Error};
@@ -60,7 +57,7 @@ fn an_adapter_below_the_limits_is_refused_by_the_limit() {
     let injected = Injected::default().with_low_limits();
     let found = message(Gpu::with_faults(true, &injected).map(drop));
     assert!(
-        found.contains("max_storage_buffers_per_shader_stage is 4 where igsr needs 8"),
+        found.contains("max_storage_buffers_per_shader_stage is 4, but igsr needs 8"),
         "{found}"
     );
 }
@@ -85,28 +82,10 @@ impl Fit {
         let scene = random_scene(&mut rng, splats, Some(1));
         let camera = random_camera(&mut rng, 128, 96);
         let mut device = GpuFit::new(Arc::clone(gpu));
-        let photo = Target {
-            width: 128,
-            height: 96,
-            channels: 3,
-            pixels: vec![90; 3 * 128 * 96],
-            weights: None,
-            depth: None,
-            background: None,
-            turns: 1,
-            until: None,
-        };
+        let photo = Target::new(128, 96, 3, vec![90; 3 * 128 * 96]);
         device.set_targets(vec![photo]).unwrap();
         let mut fit = Self { device, camera };
-        fit.upload(FitState::new(SplatArrays {
-            means: scene.means,
-            quats: scene.quats,
-            scales: scene.scales,
-            opacities: scene.opacities,
-            sh: scene.colors,
-            sh_degree: scene.sh_degree,
-        }))
-        .unwrap();
+        fit.upload(FitState::new(scene.arrays())).unwrap();
         fit
     }
 
@@ -116,34 +95,19 @@ impl Fit {
 
     fn step(&mut self, step: u32) -> splat_render::Result<()> {
         self.device.step(&StepInput {
-            view: 0,
-            camera: self.camera,
-            background: [0.0; 3],
             sh_degree: 1,
-            rates: Rates {
-                means: 1e-3,
-                quats: 1e-3,
-                scales: 5e-3,
-                opacities: 5e-2,
-                sh0: 5e-3,
-                sh_rest: 2.5e-4,
-            },
+            rates: RATES,
             step,
-            ssim_weight: 0.2,
             opacity_regularizer: 0.01,
             scale_regularizer: 0.01,
-            noise: 0.0,
-            dropout: 0.0,
             noise_seed: step,
-            camera_gradient: false,
-            exposure: None,
-            depth_weight: 0.0,
+            ..StepInput::new(0, self.camera)
         })
     }
 }
 
 #[test]
-fn a_device_lost_in_mid_fit_is_one_message_and_the_next_one_works() {
+fn a_lost_device_is_one_message_and_the_next_device_works() {
     let gpu = Arc::new(Gpu::new(true).unwrap());
     let mut fit = Fit::new(&gpu, 100);
     (1..20).for_each(|step| fit.step(step).unwrap());
@@ -165,7 +129,7 @@ fn a_device_lost_in_mid_fit_is_one_message_and_the_next_one_works() {
 }
 
 #[test]
-fn growth_beyond_the_memory_is_one_message_and_changes_no_step_in_silence() {
+fn growth_beyond_the_memory_is_one_message() {
     let injected = Injected { buffer_bytes: Some(600_000), ..Injected::default() };
     let gpu = Arc::new(faulty(&injected));
     // Splats as wide as the picture: the pairs of those before the camera outgrow the first guess of four per splat.
@@ -185,7 +149,7 @@ fn growth_beyond_the_memory_is_one_message_and_changes_no_step_in_silence() {
 }
 
 #[test]
-fn density_control_beyond_the_memory_is_one_message_and_leaves_the_splats() {
+fn density_control_beyond_the_memory_is_one_message_and_keeps_the_splats() {
     let injected = Injected { buffer_bytes: Some(600_000), ..Injected::default() };
     let gpu = Arc::new(faulty(&injected));
     let mut fit = Fit::new(&gpu, 2000);
@@ -247,6 +211,6 @@ fn a_submission_that_fails_loses_no_step_and_repeats_none() {
         failed += 1;
     }
     gpu.fail_submission(0);
-    // Four steps, the status, the steps again, each with a status of its own.
+    // Four steps, the status, the steps again, each with a separate status.
     assert!(failed >= 4 + 1 + 2 * 4, "{failed}");
 }

@@ -1,20 +1,20 @@
 //! Fitting on the GPU against fitting on the CPU, from the same start with the same draws.
 
+#[macro_use]
 mod common;
 
 use std::sync::{Arc, OnceLock};
 
 use common::*;
 use rand::Rng;
+use splat_render::Camera;
 use splat_render::cpu::CpuFit;
 use splat_render::fit::{
-    DensityControl, Exposure, FitConfig, FitDevice, FitState, Fitter, Rates, SplatArrays,
-    StepInput, Target, TargetDepth,
+    DensityControl, Exposure, FitConfig, FitDevice, FitState, Fitter, Rates, StepInput, Target,
+    TargetDepth,
 };
 use splat_render::gpu::{Gpu, GpuFit};
 use splat_render::reference::Reference;
-use splat_render::stages::ProjectOptions;
-use splat_render::{Camera, Stages};
 
 /// Photos of a random scene, their cameras, and another random scene to start from.
 struct Capture {
@@ -23,26 +23,13 @@ struct Capture {
     start: FitState,
 }
 
-fn arrays(scene: Scene<f32>) -> SplatArrays {
-    SplatArrays {
-        means: scene.means,
-        quats: scene.quats,
-        scales: scene.scales,
-        opacities: scene.opacities,
-        sh: scene.colors,
-        sh_degree: scene.sh_degree,
-    }
-}
-
 fn capture(seed: u64, sizes: &[(u32, u32)], splats: usize) -> Capture {
     let mut rng = rng(seed);
     let truth = random_scene(&mut rng, 60, Some(1)).widen();
     let (mut targets, mut cameras) = (Vec::new(), Vec::new());
     for (k, &(width, height)) in sizes.iter().enumerate() {
         let camera = random_camera(&mut rng, width, height);
-        let projected =
-            Reference.project(&truth.params(), &camera, &ProjectOptions::default()).unwrap();
-        let image = Reference.rasterize(&projected, [0.0; 3]).unwrap();
+        let image = render(&Reference, &truth.params(), &camera, [0.0; 3]);
         let byte = |v: f64| (v.clamp(0.0, 1.0) * 255.0).round() as u8;
         let rgba = k % 2 == 0;
         let mut pixels = Vec::new();
@@ -54,33 +41,15 @@ fn capture(seed: u64, sizes: &[(u32, u32)], splats: usize) -> Capture {
                 pixels.extend(color.map(byte));
             }
         }
-        let weights =
-            (k % 3 == 2).then(|| {
-                (0..width * height)
-                    .map(|_| {
-                        if rng.random::<f32>() < 0.2 {
-                            0.0
-                        } else {
-                            0.2 + 0.8 * rng.random::<f32>()
-                        }
-                    })
-                    .collect()
-            });
+        let mut weight = || {
+            if rng.random::<f32>() < 0.2 { 0.0 } else { 0.2 + 0.8 * rng.random::<f32>() }
+        };
+        let weights = (k % 3 == 2).then(|| (0..width * height).map(|_| weight()).collect());
         let channels = if rgba { 4 } else { 3 };
-        targets.push(Target {
-            width,
-            height,
-            channels,
-            pixels,
-            weights,
-            depth: None,
-            background: None,
-            turns: 1,
-            until: None,
-        });
+        targets.push(Target { weights, ..Target::new(width, height, channels, pixels) });
         cameras.push(camera);
     }
-    let start = FitState::new(arrays(random_scene(&mut rng, splats, Some(1))));
+    let start = FitState::new(random_scene(&mut rng, splats, Some(1)).arrays());
     Capture { targets, cameras, start }
 }
 
@@ -88,34 +57,28 @@ fn input(capture: &Capture, step: u32, noise: f32) -> StepInput {
     let view = step as usize % capture.cameras.len();
     let t = step as f32 * 0.37;
     StepInput {
-        view,
-        camera: capture.cameras[view],
-        // Photos with alpha stand on a background that moves, the others on black.
+        // Photos with alpha have a changing background, opaque ones black.
         background: if view.is_multiple_of(2) {
             [t.fract(), (2.0 * t).fract(), 0.5]
         } else {
             [0.0; 3]
         },
         sh_degree: u32::from(step > 20),
-        rates: Rates {
-            means: 1e-3,
-            quats: 1e-3,
-            scales: 5e-3,
-            opacities: 5e-2,
-            sh0: 5e-3,
-            sh_rest: 2.5e-4,
-        },
+        rates: RATES,
         step,
-        ssim_weight: 0.2,
         opacity_regularizer: 0.01,
         scale_regularizer: 0.01,
         noise,
         dropout: if noise > 0.0 { 0.3 } else { 0.0 },
         noise_seed: step.wrapping_mul(2_654_435_761),
         camera_gradient: true,
-        exposure: None,
-        depth_weight: 0.0,
+        ..StepInput::new(view, capture.cameras[view])
     }
+}
+
+fn begin(device: &mut dyn FitDevice, capture: &Capture) {
+    device.set_targets(capture.targets.clone()).unwrap();
+    device.upload(capture.start.clone()).unwrap();
 }
 
 fn run(
@@ -124,8 +87,7 @@ fn run(
     steps: u32,
     noise: f32,
 ) -> (FitState, Vec<f32>) {
-    device.set_targets(capture.targets.clone()).unwrap();
-    device.upload(capture.start.clone()).unwrap();
+    begin(device, capture);
     let mut losses = Vec::new();
     for step in 1..=steps {
         device.step(&input(capture, step, noise)).unwrap();
@@ -149,6 +111,20 @@ fn camera_rows(device: &mut dyn FitDevice) -> Vec<[f64; 16]> {
         .collect()
 }
 
+/// Compares camera gradients with a bound relative to each row's largest value of its kind.
+fn assert_rows_close(got: &[[f64; 16]], expected: &[[f64; 16]], bound: f64) {
+    assert_eq!(got.len(), expected.len());
+    for (step, (got, expected)) in got.iter().zip(expected).enumerate() {
+        for kinds in [0..12, 12..16] {
+            let largest = expected[kinds.clone()].iter().fold(0.0f64, |a, v| a.max(v.abs()));
+            for k in kinds {
+                let off = (got[k] - expected[k]).abs();
+                assert!(off < bound * largest, "step {step}, entry {k}: {off:.1e} of {largest}");
+            }
+        }
+    }
+}
+
 fn gpu_fit() -> GpuFit {
     GpuFit::new(shared())
 }
@@ -166,23 +142,10 @@ fn shared() -> Arc<Gpu> {
 
 /// PSNR over all photos, rendered by the reference on black.
 fn psnr(capture: &Capture, state: &FitState) -> f64 {
-    let splats = &state.splats;
-    let wide = Scene::<f32> {
-        means: splats.means.clone(),
-        quats: splats.quats.clone(),
-        scales: splats.scales.clone(),
-        opacities: splats.opacities.clone(),
-        colors: splats.sh.clone(),
-        sh_degree: splats.sh_degree,
-        sh_stride: splats.stride(),
-        raw: true,
-    }
-    .widen();
+    let wide = narrowed::widened(&state.splats.params(state.splats.sh_degree));
     let (mut total, mut count) = (0.0, 0);
     for (target, camera) in capture.targets.iter().zip(&capture.cameras) {
-        let projected =
-            Reference.project(&wide.params(), camera, &ProjectOptions::default()).unwrap();
-        let image = Reference.rasterize(&projected, [0.0; 3]).unwrap();
+        let image = render(&Reference, &wide.params(), camera, [0.0; 3]);
         let mut photo = vec![0.0; target.width as usize];
         for (row, colors) in image.color.chunks(photo.len()).enumerate() {
             for c in 0..3 {
@@ -195,6 +158,14 @@ fn psnr(capture: &Capture, state: &FitState) -> f64 {
         }
     }
     -10.0 * (total / f64::from(count)).log10()
+}
+
+/// Asserts that fits on both devices improve the picture alike.
+fn assert_improved(capture: &Capture, cpu: &FitState, gpu: &FitState) {
+    let [before, cpu, gpu] = [&capture.start, cpu, gpu].map(|state| psnr(capture, state));
+    println!("start {before:.3} dB, cpu {cpu:.3} dB, gpu {gpu:.3} dB");
+    assert!(cpu > before + 3.0, "the fit must improve the picture");
+    assert!((cpu - gpu).abs() <= 0.1);
 }
 
 #[test]
@@ -236,8 +207,7 @@ fn cameras_get_the_gradients_that_they_get_on_the_cpu() {
     let still =
         |step: u32| StepInput { rates: Rates::ZERO, noise: 0.0, ..input(&capture, step, 0.0) };
     let rows = |device: &mut dyn FitDevice| {
-        device.set_targets(capture.targets.clone()).unwrap();
-        device.upload(capture.start.clone()).unwrap();
+        begin(device, &capture);
         let mut rows = Vec::new();
         for step in 1..=steps {
             device.step(&still(step)).unwrap();
@@ -254,20 +224,7 @@ fn cameras_get_the_gradients_that_they_get_on_the_cpu() {
     };
     let (expected, got) = (rows(&mut CpuFit::default()), rows(&mut gpu_fit()));
     assert_eq!((got.len(), expected.len()), (steps as usize, steps as usize));
-    for (step, (got, expected)) in got.iter().zip(&expected).enumerate() {
-        for kinds in [0..12, 12..16] {
-            let largest = expected[kinds.clone()].iter().fold(0.0f64, |a, v| a.max(v.abs()));
-            for k in kinds {
-                let off = (got[k] - expected[k]).abs();
-                assert!(
-                    off < 1e-3 * largest,
-                    "step {step}, entry {k}: {} for {}",
-                    got[k],
-                    expected[k]
-                );
-            }
-        }
-    }
+    assert_rows_close(&got, &expected, 1e-3);
 }
 
 #[test]
@@ -285,8 +242,7 @@ fn exposures_get_the_gradients_that_they_get_on_the_cpu() {
         StepInput { exposure: (step % 7 != 3).then_some(exposure), ..input }
     };
     let rows = |device: &mut dyn FitDevice| {
-        device.set_targets(capture.targets.clone()).unwrap();
-        device.upload(capture.start.clone()).unwrap();
+        begin(device, &capture);
         let mut losses = Vec::new();
         for step in 1..=steps {
             device.step(&still(step)).unwrap();
@@ -308,21 +264,13 @@ fn exposures_get_the_gradients_that_they_get_on_the_cpu() {
             assert!(gain.max(offset) < 1e-3 * largest, "{got:?} for {expected:?}");
         }
     }
-    for (got, expected) in got.1.iter().zip(&expected.1) {
-        for kinds in [0..12, 12..16] {
-            let largest = expected[kinds.clone()].iter().fold(0.0f64, |a, v| a.max(v.abs()));
-            for k in kinds {
-                let off = (got[k] - expected[k]).abs();
-                assert!(off < 1e-3 * largest, "entry {k}: {} for {}", got[k], expected[k]);
-            }
-        }
-    }
+    assert_rows_close(&got.1, &expected.1, 1e-3);
     for (got, expected) in got.2.iter().zip(&expected.2) {
         assert!((got - expected).abs() < 1e-5, "loss {got} for {expected}");
     }
 }
 
-/// Gives all photos but the second random depths near what is there; some are not known.
+/// Random depths for all photos except the second; some are unknown.
 fn with_depths(mut capture: Capture) -> Capture {
     let mut rng = rng(77);
     for (k, target) in capture.targets.iter_mut().enumerate() {
@@ -336,7 +284,7 @@ fn with_depths(mut capture: Capture) -> Capture {
 }
 
 #[test]
-fn depths_count_as_on_the_cpu_and_repeat_themselves() {
+fn depths_count_as_on_the_cpu_and_repeat() {
     // Photos with depths and one without; now and then a step to which depths are nothing.
     let steps = 40;
     let mut capture = with_depths(capture(3, &[(64, 64), (50, 70), (64, 64)], 400));
@@ -368,27 +316,17 @@ fn depths_count_as_on_the_cpu_and_repeat_themselves() {
         assert_eq!(without.1[k] != got.1[k], counts, "step {step}");
         assert_eq!(without.0[k] != got.0[k], counts, "step {step}");
         assert!((got.1[k] - expected.1[k]).abs() < 1e-5, "loss {} for {}", got.1[k], expected.1[k]);
-        for kinds in [0..12, 12..16] {
-            let largest = expected.0[k][kinds.clone()].iter().fold(0.0f64, |a, v| a.max(v.abs()));
-            for entry in kinds {
-                let off = (got.0[k][entry] - expected.0[k][entry]).abs();
-                assert!(off < 2e-3 * largest, "step {step}, entry {entry}: {off:.1e} of {largest}");
-            }
-        }
     }
+    assert_rows_close(&got.0, &expected.0, 2e-3);
 }
 
 #[test]
 fn a_fit_ends_as_on_the_cpu_and_repeats_itself() {
     let capture = capture(2, &[(64, 64); 6], 150);
-    let before = psnr(&capture, &capture.start);
     let (expected, expected_losses) = run(&mut CpuFit::default(), &capture, 200, 0.0);
     let (got, losses) = run(&mut gpu_fit(), &capture, 200, 0.0);
-    let (cpu_psnr, gpu_psnr) = (psnr(&capture, &expected), psnr(&capture, &got));
-    println!("start {before:.3} dB, cpu {cpu_psnr:.3} dB, gpu {gpu_psnr:.3} dB");
     println!("losses: cpu {expected_losses:?}, gpu {losses:?}");
-    assert!(cpu_psnr > before + 3.0, "the fit must improve the picture");
-    assert!((cpu_psnr - gpu_psnr).abs() <= 0.1);
+    assert_improved(&capture, &expected, &got);
     let (again, losses_again) = run(&mut gpu_fit(), &capture, 200, 0.0);
     assert!(got == again && losses == losses_again, "the same fit twice gave other bits");
 }
@@ -419,13 +357,9 @@ fn a_fit_that_clones_splits_and_prunes_ends_as_on_the_cpu_and_repeats_itself() {
     };
     let (expected, cpu_counts) = fit(Box::<CpuFit>::default());
     let (got, counts) = fit(Box::new(gpu_fit()));
-    let before = psnr(&capture, &capture.start);
-    let (cpu_psnr, gpu_psnr) = (psnr(&capture, &expected), psnr(&capture, &got));
-    println!("start {before:.3} dB, cpu {cpu_psnr:.3} dB, gpu {gpu_psnr:.3} dB");
     println!("splats: cpu {cpu_counts:?}, gpu {counts:?}");
     assert!(counts.len() > 2 && counts.iter().any(|&n| n > 110), "{counts:?}");
-    assert!(cpu_psnr > before + 3.0, "the fit must improve the picture");
-    assert!((cpu_psnr - gpu_psnr).abs() <= 0.1);
+    assert_improved(&capture, &expected, &got);
     let again = fit(Box::new(gpu_fit()));
     assert!((got, counts) == again, "the same fit twice gave other bits");
 }
@@ -457,7 +391,7 @@ fn running_out_of_room_for_pairs_changes_nothing() {
     let small = gpu().with_binding_limit(128 * 96 * 48);
     let (parts, losses_parts) = run(&mut GpuFit::new(Arc::new(small)), &capture, 20, 100.0);
     assert!(whole == parts && losses == losses_parts, "a smaller device gave other bits");
-    // Steps that are done again do not move colours twice.
+    // Steps that are done again do not move colors twice.
     let (dense, _) = run(&mut gpu_fit().with_color_wait(1), &capture, 20, 100.0);
     assert!(whole == dense, "waiting for room changed bits");
 }
@@ -475,18 +409,16 @@ fn missing_splats_photos_and_sizes_are_named() {
     assert!(error.starts_with("view: "), "{error}");
 }
 
-/// A step makes no buffer, bind group or pipeline, and what a fit holds per splat stays within its
-/// stated sum.
+/// A step makes no buffer, bind group or pipeline, and memory per splat stays within the documented sum.
 #[test]
 fn steps_allocate_nothing_and_memory_grows_as_stated() {
-    // Its own device, since it counts what is made.
+    // A separate device, because it counts allocations.
     let gpu = Arc::new(gpu());
     let bytes_of = |splats: usize| {
         let capture = capture(5, &[(64, 48), (50, 50)], splats);
         let (_, before) = gpu.made();
         let mut fit = GpuFit::new(Arc::clone(&gpu));
-        fit.set_targets(capture.targets.clone()).unwrap();
-        fit.upload(capture.start.clone()).unwrap();
+        begin(&mut fit, &capture);
         let (_, bytes) = gpu.made();
         for step in 1..=10 {
             fit.step(&input(&capture, step, 0.0)).unwrap();
@@ -503,7 +435,7 @@ fn steps_allocate_nothing_and_memory_grows_as_stated() {
     };
     let (few, many) = (1500, 3000);
     let per_splat = (bytes_of(many) - bytes_of(few)) as f64 / (many - few) as f64;
-    // 11 floats of geometry and 12 of colour (SH 1): values and two moments; notes, 2D splat and its
+    // 11 floats of geometry and 12 of color (SH 1): values and two moments; notes, 2D splat and its
     // gradient, depth keys, order and offsets; room for 4 pairs of 60 bytes.
     let parameters = 3.0 * (11.0 + 12.0);
     let stated = 4.0 * (parameters + 9.0 + 12.0 + 10.0 + 2.0 + 2.0 + 1.0) + 4.0 * 60.0;
@@ -512,22 +444,14 @@ fn steps_allocate_nothing_and_memory_grows_as_stated() {
 }
 
 #[test]
-fn frozen_steps_keep_the_moments() {
-    common::agreement::frozen_steps_keep_the_moments(&mut GpuFit::new(shared()));
-}
-
-#[test]
-fn the_last_splats_stay() {
-    common::agreement::the_last_splats_stay(&mut GpuFit::new(shared()));
-}
-
-#[test]
-fn senseless_steps_are_refused() {
-    common::agreement::senseless_steps_are_refused(&mut GpuFit::new(shared()));
-}
-
-#[test]
 fn waiting_colors_end_with_the_same_bits() {
     let device = |most| GpuFit::new(shared()).with_color_wait(most);
     common::waiting::waiting_colors_end_with_the_same_bits(device);
+}
+
+checks! {
+    [&mut GpuFit::new(shared())];
+    agreement::frozen_steps_keep_the_moments();
+    agreement::the_last_splats_stay();
+    agreement::invalid_steps_are_refused();
 }

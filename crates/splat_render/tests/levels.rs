@@ -1,11 +1,13 @@
-//! Scenes in levels of detail: what is written comes back within budgets, and damage is told.
+//! Scenes in levels of detail: round trips within budgets, and damage.
 
 use std::path::{Path, PathBuf};
 
 use serde_json::{Value, json};
 use splat_render::fit::SplatArrays;
 use splat_render::io::{SplatFile, write_splats};
-use splat_render::levels::{INDEX, Manifest, Resident, coarsest, read_within, write_levels};
+use splat_render::levels::{
+    INDEX, LevelsWritten, Manifest, Resident, coarsest, read_within, write_levels,
+};
 
 /// A folder that goes away with this.
 struct Folder(PathBuf);
@@ -20,6 +22,19 @@ impl Folder {
 
     fn join(&self, name: &str) -> PathBuf {
         self.0.join(name)
+    }
+
+    /// The folder of the levels.
+    fn out(&self) -> PathBuf {
+        self.join("out")
+    }
+
+    /// Writes a scene and its levels, in cells of about 100 splats.
+    fn write(&self, file: &SplatFile, levels: usize) -> LevelsWritten {
+        write_splats(&self.join("scene.ply"), file).expect("a scene");
+        std::fs::create_dir(self.out()).expect("a folder");
+        let written = write_levels(&self.join("scene.ply"), &self.out(), levels, 100, &mut || true);
+        written.expect("levels").expect("all of it")
     }
 }
 
@@ -49,11 +64,7 @@ fn field() -> SplatFile {
 /// Levels of the field in a new folder: three of them, in cells of about 100.
 fn written(name: &str) -> Folder {
     let folder = Folder::new(name);
-    write_splats(&folder.join("scene.ply"), &field()).expect("a scene");
-    std::fs::create_dir(folder.join("out")).expect("a folder");
-    let done = write_levels(&folder.join("scene.ply"), &folder.join("out"), 3, 100, &mut || true)
-        .expect("levels")
-        .expect("all of it");
+    let done = folder.write(&field(), 3);
     assert_eq!(done.counts[0], 1600);
     assert!((250..=450).contains(&done.counts[1]), "{done:?}");
     assert!((40..=120).contains(&done.counts[2]), "{done:?}");
@@ -62,18 +73,18 @@ fn written(name: &str) -> Folder {
 }
 
 fn index(folder: &Folder) -> Value {
-    let text = std::fs::read(folder.join("out").join(INDEX)).expect("an index");
+    let text = std::fs::read(folder.out().join(INDEX)).expect("an index");
     serde_json::from_slice(&text).expect("JSON")
 }
 
 fn store(folder: &Folder, index: &Value) {
-    std::fs::write(folder.join("out").join(INDEX), index.to_string()).expect("an index");
+    std::fs::write(folder.out().join(INDEX), index.to_string()).expect("an index");
 }
 
 #[test]
-fn the_finest_level_has_all_splats_and_each_budget_the_finest_that_fits() {
+fn each_budget_gives_the_finest_level_that_fits() {
     let folder = written("round");
-    let (all, level) = read_within(&folder.join("out"), 1600).expect("levels");
+    let (all, level) = read_within(&folder.out(), 1600).expect("levels");
     assert_eq!((all.splats.len(), level), (1600, 0));
     assert_eq!((all.origin, all.antialiased), ([1000.5, 0.0, -7.0], true));
     let sorted = |splats: &SplatArrays| {
@@ -83,25 +94,20 @@ fn the_finest_level_has_all_splats_and_each_budget_the_finest_that_fits() {
         rows
     };
     assert_eq!(sorted(&all.splats), sorted(&field().splats));
-    let (some, level) = read_within(&folder.join("out"), 1599).expect("levels");
+    let (some, level) = read_within(&folder.out(), 1599).expect("levels");
     assert_eq!(level, 1);
     assert!(some.splats.len() < 450);
-    let error = read_within(&folder.join("out"), 20).map(|_| ()).expect_err("too few").to_string();
+    let error = read_within(&folder.out(), 20).map(|_| ()).expect_err("too few").to_string();
     assert!(error.contains("coarsest level"), "{error}");
 }
 
 #[test]
-fn what_is_written_is_the_published_layout() {
+fn the_files_have_the_published_layout() {
     let folder = written("layout");
     let index = index(&folder);
     assert_eq!((&index["version"], &index["lodLevels"]), (&json!(1), &json!(3)));
     assert_eq!(index["lodErrors"], json!(true));
-    let counts: Vec<u64> = index["counts"]
-        .as_array()
-        .expect("counts")
-        .iter()
-        .map(|n| n.as_u64().expect("n"))
-        .collect();
+    let counts: Vec<u64> = serde_json::from_value(index["counts"].clone()).expect("counts");
     assert_eq!(index["count"].as_u64(), Some(counts.iter().sum()));
     // Interior nodes have two children and the box around theirs; leaves have levels and errors.
     fn walk(node: &Value) -> ([f64; 3], [f64; 3]) {
@@ -127,7 +133,7 @@ fn what_is_written_is_the_published_layout() {
     }
     walk(&index["tree"]);
     // Runs cover each file, and a file has one level.
-    let manifest = Manifest::read(&folder.join("out")).expect("a manifest");
+    let manifest = Manifest::read(&folder.out()).expect("a manifest");
     for (file, name) in manifest.files.iter().enumerate() {
         let mut runs: Vec<(usize, usize, usize)> = Vec::new();
         for cell in &manifest.cells {
@@ -141,7 +147,7 @@ fn what_is_written_is_the_published_layout() {
             assert_eq!((*offset, *level), (end, runs[0].2));
             end += count;
         }
-        let path = folder.join("out").join(name.to_str().expect("a name"));
+        let path = folder.out().join(name.to_str().expect("a name"));
         let meta: Value =
             serde_json::from_slice(&std::fs::read(path).expect("a SOG")).expect("JSON");
         assert_eq!(meta["count"].as_u64(), Some(end as u64));
@@ -154,27 +160,24 @@ fn the_same_scene_gives_the_same_files() {
     let (one, other) = (written("one"), written("other"));
     let files = |folder: &Folder| {
         let mut all = Vec::new();
-        for entry in std::fs::read_dir(folder.join("out")).expect("a folder").flatten() {
+        for entry in std::fs::read_dir(folder.out()).expect("a folder").flatten() {
             match std::fs::read_dir(entry.path()) {
                 Ok(inner) => all.extend(inner.flatten().map(|e| e.path())),
                 Err(_) => all.push(entry.path()),
             }
         }
-        let mut all: Vec<(PathBuf, Vec<u8>)> = all
-            .into_iter()
-            .map(|path| {
-                let bytes = std::fs::read(&path).expect("bytes");
-                (path.strip_prefix(&folder.0).expect("inside").to_owned(), bytes)
-            })
-            .collect();
         all.sort();
-        all
+        let read = |path: PathBuf| {
+            let bytes = std::fs::read(&path).expect("bytes");
+            (path.strip_prefix(&folder.0).expect("inside").to_owned(), bytes)
+        };
+        all.into_iter().map(read).collect::<Vec<_>>()
     };
     assert_eq!(files(&one), files(&other));
 }
 
 #[test]
-fn scenes_and_numbers_that_give_no_levels_are_refused() {
+fn invalid_scenes_and_numbers_are_refused() {
     let folder = Folder::new("refused");
     let scene = folder.join("scene.ply");
     let mut file = field();
@@ -197,10 +200,10 @@ fn scenes_and_numbers_that_give_no_levels_are_refused() {
 }
 
 #[test]
-fn it_stops_within_a_cell_where_it_is_told_to() {
-    let folder = Folder::new("told");
+fn writing_stops_on_request() {
+    let folder = Folder::new("stop");
     write_splats(&folder.join("scene.ply"), &field()).expect("a scene");
-    // While it looks for cells, while it puts splats into them, before any cell is merged, and after some.
+    // While cells are found, while they are filled, before the first is merged, and after some.
     for asked in [0, 1, 2, 3] {
         let out = folder.join(&format!("out{asked}"));
         std::fs::create_dir(&out).expect("a folder");
@@ -211,22 +214,18 @@ fn it_stops_within_a_cell_where_it_is_told_to() {
         };
         let done = write_levels(&folder.join("scene.ply"), &out, 3, 100, &mut goes_on);
         assert_eq!(done.expect("no error"), None);
-        assert_eq!(left, -1, "it goes on though told to stop");
+        assert_eq!(left, -1, "it does not stop");
         assert!(!out.join(INDEX).exists());
     }
 }
 
 #[test]
-fn splats_that_no_renderer_draws_are_left_out_and_counted() {
+fn invalid_splats_are_left_out_and_counted() {
     let folder = Folder::new("left");
     let mut file = field();
     file.splats.opacities[7] = f32::NAN;
     file.splats.quats[9] = [0.0; 4];
-    write_splats(&folder.join("scene.ply"), &file).expect("a scene");
-    std::fs::create_dir(folder.join("out")).expect("a folder");
-    let done = write_levels(&folder.join("scene.ply"), &folder.join("out"), 2, 100, &mut || true)
-        .expect("levels")
-        .expect("all of it");
+    let done = folder.write(&file, 2);
     assert_eq!(done.counts[0], 1598);
     assert!(done.notes[0].starts_with("2 splats"), "{:?}", done.notes);
 }
@@ -240,20 +239,20 @@ fn leaf(mut node: &mut Value) -> &mut Value {
 }
 
 #[test]
-fn what_an_index_may_not_say_is_one_message_that_names_it() {
+fn an_invalid_index_is_one_message_that_names_it() {
     type Change = fn(&mut Value);
     let changes: [(&str, Change); 19] = [
         ("version 2", |m| m["version"] = json!(2)),
         ("lodLevels", |m| m["lodLevels"] = json!(0)),
         ("lodLevels", |m| m["lodLevels"] = json!(1e12)),
         ("filenames", |m| m["filenames"] = json!("0_0/meta.json")),
-        ("no text", |m| m["filenames"][0] = json!(7)),
-        ("does not lie in its folder", |m| m["filenames"][0] = json!("../scene.ply")),
-        ("does not lie in its folder", |m| m["filenames"][0] = json!("/etc/passwd")),
-        ("does not lie in its folder", |m| m["filenames"][0] = json!("a/../../b/meta.json")),
-        ("does not lie in its folder", |m| m["filenames"][0] = json!("..\\b\\meta.json")),
-        ("does not lie in its folder", |m| m["filenames"][0] = json!("C:meta.json")),
-        ("does not lie in its folder", |m| m["environment"] = json!("http://a/b")),
+        ("not text", |m| m["filenames"][0] = json!(7)),
+        ("is not in its folder", |m| m["filenames"][0] = json!("../scene.ply")),
+        ("is not in its folder", |m| m["filenames"][0] = json!("/etc/passwd")),
+        ("is not in its folder", |m| m["filenames"][0] = json!("a/../../b/meta.json")),
+        ("is not in its folder", |m| m["filenames"][0] = json!("..\\b\\meta.json")),
+        ("is not in its folder", |m| m["filenames"][0] = json!("C:meta.json")),
+        ("is not in its folder", |m| m["environment"] = json!("http://a/b")),
         ("no tree", |m| drop(m.as_object_mut().expect("an object").remove("tree"))),
         ("children", |m| m["tree"] = json!({})),
         ("bound", |m| leaf(&mut m["tree"])["bound"]["min"] = json!([1e9, 0, 0])),
@@ -269,18 +268,18 @@ fn what_an_index_may_not_say_is_one_message_that_names_it() {
         let mut index = whole.clone();
         change(&mut index);
         store(&folder, &index);
-        let error = Manifest::read(&folder.join("out")).expect_err(words).to_string();
+        let error = Manifest::read(&folder.out()).expect_err(words).to_string();
         assert!(error.contains(words) && error.contains(INDEX), "{words}: {error}");
         assert_eq!(error.lines().count(), 1);
     }
-    // What others write, before the format had versions.
+    // An index by other programs, before the format had versions.
     let mut index = whole;
     for name in ["version", "asset", "count", "counts", "lodErrors", "origin"] {
         index.as_object_mut().expect("an object").remove(name);
     }
     index["environment"] = Value::Null;
     store(&folder, &index);
-    let manifest = Manifest::read(&folder.join("out")).expect("an older index");
+    let manifest = Manifest::read(&folder.out()).expect("an older index");
     assert_eq!((manifest.cells.len(), manifest.origin), (16, [0.0; 3]));
     assert!(manifest.cells.iter().all(|c| c.errors[0] == 0.0 && c.errors[2] > c.errors[1]));
 }
@@ -305,9 +304,9 @@ fn damaged_bytes_of_an_index_never_panic() {
                 _ => bytes.truncate(at.max(1)),
             }
         }
-        std::fs::write(folder.join("out").join(INDEX), &bytes).expect("an index");
-        if let Ok(manifest) = Manifest::read(&folder.join("out")) {
-            // Numbers that could be read are within what files hold, or told when these are read.
+        std::fs::write(folder.out().join(INDEX), &bytes).expect("an index");
+        if let Ok(manifest) = Manifest::read(&folder.out()) {
+            // Numbers that were accepted are within the files, or reported on reading.
             let mut resident = Resident::new(&manifest, 10_000).expect("no environment");
             let choice = coarsest(&manifest, resident.room());
             for file in resident.missing(&manifest, &choice) {
@@ -319,15 +318,14 @@ fn damaged_bytes_of_an_index_never_panic() {
     // Deep nesting is an error, too, and not a stack that ends.
     let deep = "{\"children\":[".repeat(100_000);
     let index = format!("{{\"version\":1,\"lodLevels\":1,\"filenames\":[],\"tree\":{deep}");
-    std::fs::write(folder.join("out").join(INDEX), index).expect("an index");
-    Manifest::read(&folder.join("out")).expect_err("too deep");
+    std::fs::write(folder.out().join(INDEX), index).expect("an index");
+    Manifest::read(&folder.out()).expect_err("too deep");
 }
 
 #[test]
-fn files_that_are_missing_or_hold_other_numbers_of_splats_are_named() {
+fn missing_and_wrong_files_are_named() {
     let folder = written("files");
-    let say =
-        || read_within(&folder.join("out"), 2000).map(|_| ()).expect_err("damage").to_string();
+    let say = || read_within(&folder.out(), 2000).map(|_| ()).expect_err("damage").to_string();
     // More than the index says, then fewer.
     let whole = index(&folder);
     let mut other = whole.clone();
@@ -336,7 +334,7 @@ fn files_that_are_missing_or_hold_other_numbers_of_splats_are_named() {
         leaf(&mut other["tree"])["lods"]["0"]["count"] = json!(wrong);
         store(&folder, &other);
         let error = say();
-        let words = format!("holds {count} splats where {INDEX} says {wrong}");
+        let words = format!("holds {count} splats, but {INDEX} says {wrong}");
         assert!(error.contains(&words) && error.contains("0_0"), "{error}");
     }
     store(&folder, &whole);

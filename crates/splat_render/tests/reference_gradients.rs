@@ -1,16 +1,17 @@
 //! The reference's gradients against central differences, for every kind of parameter, the camera
 //! and the loss, on random small scenes. Samples within a step of a kink are redrawn and counted.
 
+mod common;
+
 use glam::{DMat4, DQuat, DVec3};
 use rand::{Rng, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use splat_render::fit::{Rates, Target, TargetDepth};
 use splat_render::reference::{Reference, decisions};
+use splat_render::sh::coeffs;
 use splat_render::splats::SplatArrays;
 use splat_render::stages::{AdamState, AdamStep, DepthLoss, Exposure};
-use splat_render::{
-    Camera, Colors, Image, ImageGradients, ProjectOptions, SplatGradients, SplatParams, Stages,
-};
+use splat_render::{Camera, Image, ImageGradients, ProjectOptions, SplatGradients, Stages};
 
 const SCENES: u64 = 240;
 const SAMPLES_PER_KIND: usize = 3;
@@ -30,14 +31,7 @@ const KINDS: [&str; 9] = [
 
 #[derive(Clone)]
 struct Scene {
-    means: Vec<[f64; 3]>,
-    quats: Vec<[f64; 4]>,
-    scales: Vec<[f64; 3]>,
-    opacities: Vec<f64>,
-    colors: Vec<[f64; 3]>,
-    /// None: direct colours.
-    degree: Option<u32>,
-    raw: bool,
+    splats: common::Scene<f64>,
     antialiased: bool,
     background: [f64; 3],
     camera: Camera,
@@ -52,7 +46,7 @@ impl Scene {
         let degree = [None, Some(0), Some(1), Some(2), Some(3), Some(4)][(seed % 6) as usize];
         let raw = seed.is_multiple_of(2);
         let mut f = |low: f64, high: f64| rng.random_range(low..high);
-        let rows = degree.map_or(n, |d| n * splat_render::sh::coeffs(d));
+        let rows = n * degree.map_or(1, coeffs);
         let fov = f(0.5, 1.6);
         let focal = 0.5 * f64::from(width) / (0.5 * fov).tan();
         // Wide offsets, so that some splats lie beyond the Jacobian's limits.
@@ -83,13 +77,16 @@ impl Scene {
         };
         let pixels = (width * height) as usize;
         Self {
-            means,
-            quats,
-            scales,
-            opacities,
-            colors,
-            degree,
-            raw,
+            splats: common::Scene {
+                means,
+                quats,
+                scales,
+                opacities,
+                colors,
+                sh_degree: degree.unwrap_or(0),
+                sh_stride: degree.map_or(0, coeffs),
+                raw,
+            },
             antialiased: (seed / 6).is_multiple_of(2),
             background: std::array::from_fn(|_| f(0.0, 1.0)),
             camera,
@@ -101,24 +98,6 @@ impl Scene {
         }
     }
 
-    fn params(&self) -> SplatParams<'_, f64> {
-        SplatParams {
-            means: &self.means,
-            quats: &self.quats,
-            scales: &self.scales,
-            opacities: &self.opacities,
-            colors: match self.degree {
-                None => Colors::Direct(&self.colors),
-                Some(degree) => Colors::Sh {
-                    degree,
-                    stride: splat_render::sh::coeffs(degree),
-                    coeffs: &self.colors,
-                },
-            },
-            raw: self.raw,
-        }
-    }
-
     fn options(&self) -> ProjectOptions {
         ProjectOptions { antialiased: self.antialiased, ..ProjectOptions::default() }
     }
@@ -126,7 +105,7 @@ impl Scene {
     /// The loss, a fixed linear function of the picture, and the decisions taken.
     fn loss(&self) -> (f64, u64) {
         let options = self.options();
-        let projected = Reference.project(&self.params(), &self.camera, &options).unwrap();
+        let projected = Reference.project(&self.splats.params(), &self.camera, &options).unwrap();
         let image = Reference.rasterize(&projected, self.background).unwrap();
         let mut loss = 0.0;
         for pixel in 0..image.alpha.len() {
@@ -136,40 +115,37 @@ impl Scene {
             loss += image.alpha[pixel] * self.v_image.v_alpha[pixel];
             loss += image.depth[pixel] * self.v_image.v_depth[pixel];
         }
-        (loss, decisions(&self.params(), &self.camera, &options, &projected))
+        (loss, decisions(&self.splats.params(), &self.camera, &options, &projected))
     }
 
     fn gradients(&self) -> (SplatGradients<f64>, [f64; 3]) {
         let options = self.options();
-        let projected = Reference.project(&self.params(), &self.camera, &options).unwrap();
+        let projected = Reference.project(&self.splats.params(), &self.camera, &options).unwrap();
         let image = Reference.rasterize(&projected, self.background).unwrap();
         let v_projected = Reference
             .rasterize_backward(&projected, self.background, &image, &self.v_image, false)
             .unwrap();
         let gradients = Reference
-            .project_backward(&self.params(), &self.camera, &options, &projected, &v_projected)
+            .project_backward(
+                &self.splats.params(),
+                &self.camera,
+                &options,
+                &projected,
+                &v_projected,
+            )
             .unwrap();
         (gradients, v_projected.v_background)
     }
 
     fn entry(&mut self, kind: usize, index: usize) -> &mut f64 {
         match kind {
-            0 => &mut self.means[index / 3][index % 3],
-            1 => &mut self.quats[index / 4][index % 4],
-            2 => &mut self.scales[index / 3][index % 3],
-            3 => &mut self.opacities[index],
-            4 => &mut self.colors[index / 3][index % 3],
+            0 => &mut self.splats.means.as_flattened_mut()[index],
+            1 => &mut self.splats.quats.as_flattened_mut()[index],
+            2 => &mut self.splats.scales.as_flattened_mut()[index],
+            3 => &mut self.splats.opacities[index],
+            4 => &mut self.splats.colors.as_flattened_mut()[index],
             5 => &mut self.background[index],
-            6 => {
-                let column = index % 4;
-                let axis = match column {
-                    0 => &mut self.camera.viewmat.x_axis,
-                    1 => &mut self.camera.viewmat.y_axis,
-                    2 => &mut self.camera.viewmat.z_axis,
-                    _ => &mut self.camera.viewmat.w_axis,
-                };
-                &mut axis[index / 4]
-            }
+            6 => &mut self.camera.viewmat.as_mut()[index % 4 * 4 + index / 4],
             7 if index == 0 => &mut self.camera.fx,
             7 => &mut self.camera.fy,
             _ if index == 0 => &mut self.camera.cx,
@@ -191,6 +167,22 @@ impl Scene {
             _ => g.v_intrinsics[2..].to_vec(),
         }
     }
+}
+
+/// Central difference of a loss by one entry of its argument, with step `h`.
+fn slope<A>(
+    argument: &mut A,
+    entry: impl Fn(&mut A) -> &mut f64,
+    h: f64,
+    loss: impl Fn(&A) -> f64,
+) -> f64 {
+    let value = *entry(argument);
+    *entry(argument) = value + h;
+    let high = loss(argument);
+    *entry(argument) = value - h;
+    let low = loss(argument);
+    *entry(argument) = value;
+    (high - low) / (2.0 * h)
 }
 
 #[test]
@@ -252,19 +244,10 @@ fn photo_and_picture(seed: u64) -> (Target, Image<f64>) {
     let (width, height) = (rng.random_range(1..18u32), rng.random_range(1..18u32));
     let pixels = (width * height) as usize;
     let channels = if seed.is_multiple_of(2) { 4 } else { 3 };
-    let target = Target {
-        width,
-        height,
-        channels,
-        pixels: (0..pixels * channels as usize).map(|_| rng.random()).collect(),
-        weights: seed
-            .is_multiple_of(3)
-            .then(|| (0..pixels).map(|_| rng.random_range(0.1..1.0)).collect()),
-        depth: None,
-        background: None,
-        turns: 1,
-        until: None,
-    };
+    let colors = (0..pixels * channels as usize).map(|_| rng.random()).collect();
+    let weighted = seed.is_multiple_of(3);
+    let weights = weighted.then(|| (0..pixels).map(|_| rng.random_range(0.1..1.0)).collect());
+    let target = Target { weights, ..Target::new(width, height, channels, colors) };
     let image = Image {
         width,
         height,
@@ -290,14 +273,10 @@ fn the_loss_s_gradient_matches_central_differences() {
         let mut rng = Pcg64Mcg::seed_from_u64(seed ^ 0x5eed);
         for _ in 0..12 {
             let (pixel, c) = (rng.random_range(0..image.color.len()), rng.random_range(0..3));
-            let value = image.color[pixel][c];
-            let mut at = |value: f64| {
-                image.color[pixel][c] = value;
-                loss(&image).value
-            };
-            let (high, low, _) = (at(value + 1e-6), at(value - 1e-6), at(value));
-            let error = ((high - low) / 2e-6 - analytic[pixel][c]).abs() / largest;
-            // Within a step of the photo's colour the distance has its kink; bytes are that far
+            let numeric =
+                slope(&mut image, |image| &mut image.color[pixel][c], 1e-6, |x| loss(x).value);
+            let error = (numeric - analytic[pixel][c]).abs() / largest;
+            // Within a step of the photo's color the distance has its kink; bytes are that far
             // from random numbers.
             assert!(error <= 1e-6, "seed {seed}, pixel {pixel}, channel {c}: {error:.1e}");
             worst = worst.max(error);
@@ -316,7 +295,7 @@ fn the_exposure_s_gradients_match_central_differences() {
         let mut rng = Pcg64Mcg::seed_from_u64(seed ^ 0xe5e);
         image.transmittance.iter_mut().for_each(|t| *t = rng.random());
         let background = [0.2, 0.7, 0.4];
-        // So that no colour is cut.
+        // So that no color is cut.
         let mut exposure = Exposure {
             gain: std::array::from_fn(|_| rng.random_range(0.4..0.8)),
             offset: std::array::from_fn(|_| rng.random_range(0.02..0.15)),
@@ -337,39 +316,20 @@ fn the_exposure_s_gradients_match_central_differences() {
         };
         let h = 1e-6;
         for c in 0..3 {
-            let value = exposure.gain[c];
-            let mut at = |value: f64| {
-                exposure.gain[c] = value;
-                loss(&image, &exposure).value
-            };
-            let (high, low, _) = (at(value + h), at(value - h), at(value));
-            check("gain", (high - low) / (2.0 * h), analytic.v_gain[c], largest);
-            let value = exposure.offset[c];
-            let mut at = |value: f64| {
-                exposure.offset[c] = value;
-                loss(&image, &exposure).value
-            };
-            let (high, low, _) = (at(value + h), at(value - h), at(value));
-            check("offset", (high - low) / (2.0 * h), analytic.v_offset[c], largest);
+            let numeric = slope(&mut exposure, |e| &mut e.gain[c], h, |e| loss(&image, e).value);
+            check("gain", numeric, analytic.v_gain[c], largest);
+            let numeric = slope(&mut exposure, |e| &mut e.offset[c], h, |e| loss(&image, e).value);
+            check("offset", numeric, analytic.v_offset[c], largest);
         }
         let largest = analytic.v_color.as_flattened().iter().fold(0.0f64, |a, v| a.max(v.abs()));
+        let loss = |image: &Image<f64>| loss(image, &exposure).value;
         for _ in 0..6 {
             let (pixel, c) = (rng.random_range(0..image.color.len()), rng.random_range(0..3));
-            let value = image.color[pixel][c];
-            let mut at = |value: f64| {
-                image.color[pixel][c] = value;
-                loss(&image, &exposure).value
-            };
-            let (high, low, _) = (at(value + h), at(value - h), at(value));
-            check("color", (high - low) / (2.0 * h), analytic.v_color[pixel][c], largest);
-            let value = image.transmittance[pixel];
-            let mut at = |value: f64| {
-                image.transmittance[pixel] = value;
-                loss(&image, &exposure).value
-            };
+            let numeric = slope(&mut image, |image| &mut image.color[pixel][c], h, loss);
+            check("color", numeric, analytic.v_color[pixel][c], largest);
             // Alpha is 1 - transmittance.
-            let (high, low, _) = (at(value - h), at(value + h), at(value));
-            check("alpha", (high - low) / (2.0 * h), analytic.v_alpha[pixel], largest);
+            let numeric = -slope(&mut image, |image| &mut image.transmittance[pixel], h, loss);
+            check("alpha", numeric, analytic.v_alpha[pixel], largest);
         }
     }
     println!("worst {worst:.1e} of the largest");
@@ -406,16 +366,15 @@ fn the_depth_loss_s_gradients_match_central_differences() {
             }
             for of_depth in [false, true] {
                 let value = if of_depth { image.depth[pixel] } else { image.alpha[pixel] };
-                let h = 1e-6 * value;
-                let mut at = |value: f64| {
-                    let entry = if of_depth { &mut image.depth } else { &mut image.alpha };
-                    entry[pixel] = value;
-                    loss(&image).value
-                };
-                let (high, low, _) = (at(value + h), at(value - h), at(value));
+                let numeric = slope(
+                    &mut image,
+                    |i| if of_depth { &mut i.depth[pixel] } else { &mut i.alpha[pixel] },
+                    1e-6 * value,
+                    |image| loss(image).value,
+                );
                 let rows = if of_depth { &analytic.v_depth } else { &analytic.v_alpha };
-                // What the loss changes by when the number doubles, of a mean of so many.
-                let error = ((high - low) / (2.0 * h) - rows[pixel]) * value * pixels as f64;
+                // Change of the loss if the number doubles, times the number of pixels.
+                let error = (numeric - rows[pixel]) * value * pixels as f64;
                 assert!(error.abs() <= 1e-5, "seed {seed}, pixel {pixel}: {error:.1e}");
                 worst = worst.max(error.abs());
                 samples += usize::from(rows[pixel] != 0.0);
@@ -426,19 +385,22 @@ fn the_depth_loss_s_gradients_match_central_differences() {
     assert!(samples > 1000);
 }
 
+fn one_pixel(alpha: f64, depth: f64) -> Image<f64> {
+    Image {
+        width: 1,
+        height: 1,
+        color: vec![[0.0; 3]],
+        alpha: vec![alpha],
+        depth: vec![depth],
+        transmittance: vec![1.0 - alpha],
+    }
+}
+
 #[test]
 fn a_depth_loss_has_its_bounds() {
     let with = |alpha: f64, depth: f64, z: f32, confidence: f32| {
-        let image = Image {
-            width: 1,
-            height: 1,
-            color: vec![[0.0; 3]],
-            alpha: vec![alpha],
-            depth: vec![depth],
-            transmittance: vec![1.0 - alpha],
-        };
         let target = TargetDepth { depths: vec![z], confidences: vec![confidence] };
-        Reference.depth_loss(&image, &target).unwrap()
+        Reference.depth_loss(&one_pixel(alpha, depth), &target).unwrap()
     };
     // One per cent too far; on it; absurdly wrong; too clear to have a depth; not known.
     assert!((with(1.0, 2.02, 2.0, 1.0).value - 0.01).abs() < 1e-4);
@@ -459,22 +421,14 @@ fn a_depth_loss_has_its_bounds() {
     ];
     for (z, confidence) in wrong {
         let target = TargetDepth { depths: vec![z], confidences: vec![confidence] };
-        let image = photo_and_picture(0).1;
-        let image = Image {
-            width: 1,
-            height: 1,
-            color: image.color[..1].to_vec(),
-            alpha: vec![1.0],
-            depth: vec![1.0],
-            transmittance: vec![0.0],
-        };
+        let image = one_pixel(1.0, 1.0);
         let error = Reference.depth_loss(&image, &target).unwrap_err().to_string();
         assert!(error.starts_with("target: has a depth"), "{error}");
     }
 }
 
 #[test]
-fn a_cut_colour_is_only_brought_back() {
+fn a_cut_color_is_only_brought_back() {
     let image = Image {
         width: 4,
         height: 1,
@@ -488,33 +442,24 @@ fn a_cut_colour_is_only_brought_back() {
     assert_eq!(corrected, [[1.0; 3], [1.0; 3], [0.0; 3], [0.0; 3]]);
     let v = [[0.5; 3], [-0.5; 3], [0.5; 3], [-0.5; 3]];
     let back = Reference.exposure_backward(&image, &exposure, &v).unwrap();
-    // Brighter than white goes down and blacker than black goes up, and not the other way.
+    // Gradients pass if they bring a clamped color back into the range.
     assert_eq!(back.v_color, [[1.0; 3], [0.0; 3], [0.0; 3], [-1.0; 3]]);
     assert_eq!(back.v_offset, [0.0; 3]);
     assert!((back.v_gain[0] - 0.5 * (0.9 - 0.05)).abs() < 1e-12);
 }
 
-/// With first moments that keep nothing but the gradient, a step goes along it: what adam takes for
-/// the regularisers' gradients is read off and held against differences of the regularisers.
+/// With first moments that hold only the gradient, adam's step gives the regularizers' gradients, which
+/// are compared with differences of the regularizers.
 #[test]
-fn the_regularisers_pull_along_their_gradients() {
+fn the_regularizers_pull_along_their_gradients() {
     let mut rng = Pcg64Mcg::seed_from_u64(5);
     let n = 9;
+    let zeros = common::convert_arrays(&SplatArrays::zeros(n, 0), f64::from);
     let mut splats = SplatArrays {
-        means: vec![[0.0; 3]; n],
         quats: vec![[1.0, 0.0, 0.0, 0.0]; n],
         scales: (0..n).map(|_| std::array::from_fn(|_| rng.random_range(-3.0..1.0))).collect(),
         opacities: (0..n).map(|_| rng.random_range(-4.0..4.0)).collect(),
-        sh: vec![[0.0; 3]; n],
-        sh_degree: 0,
-    };
-    let zeros = SplatArrays {
-        means: vec![[0.0; 3]; n],
-        quats: vec![[0.0; 4]; n],
-        scales: vec![[0.0; 3]; n],
-        opacities: vec![0.0; n],
-        sh: vec![[0.0; 3]; n],
-        sh_degree: 0,
+        ..zeros.clone()
     };
     let mut state =
         AdamState { splats: splats.clone(), first: zeros.clone(), second: zeros.clone() };
@@ -537,7 +482,7 @@ fn the_regularisers_pull_along_their_gradients() {
     };
     Reference.adam(&mut state, &gradients, &step).unwrap();
     // 0.25 times the mean opacity and 0.5 times the mean scale.
-    let regularisers = |splats: &SplatArrays<f64>| {
+    let regularizers = |splats: &SplatArrays<f64>| {
         let opacities: f64 = splats.opacities.iter().map(|o| 1.0 / (1.0 + (-o).exp())).sum();
         let scales: f64 = splats.scales.as_flattened().iter().map(|s| s.exp()).sum();
         0.25 * opacities / n as f64 + 0.5 * scales / (3 * n) as f64
@@ -545,15 +490,12 @@ fn the_regularisers_pull_along_their_gradients() {
     let part = 1.0 - f64::from(splat_render::constants::ADAM.0);
     for i in 0..n {
         for k in 0..4 {
-            let at = |splats: &mut SplatArrays<f64>, by: f64| {
-                let value = if k < 3 { &mut splats.scales[i][k] } else { &mut splats.opacities[i] };
-                *value += by;
-                let sum = regularisers(splats);
-                let value = if k < 3 { &mut splats.scales[i][k] } else { &mut splats.opacities[i] };
-                *value -= by;
-                sum
-            };
-            let numeric = (at(&mut splats, 1e-5) - at(&mut splats, -1e-5)) / 2e-5;
+            let numeric = slope(
+                &mut splats,
+                |s| if k < 3 { &mut s.scales[i][k] } else { &mut s.opacities[i] },
+                1e-5,
+                regularizers,
+            );
             let taken = if k < 3 { state.first.scales[i][k] } else { state.first.opacities[i] };
             assert!((taken / part - numeric).abs() < 1e-9, "{} for {numeric}", taken / part);
         }

@@ -8,7 +8,6 @@ use splat_render::{Error, Result};
 
 use crate::display::Drawing;
 
-/// What `--help` prints.
 pub const HELP: &str = "\
 Show Gaussian splats in a window, or draw pictures of them.
 
@@ -37,49 +36,41 @@ View:
   --cameras PATH       cameras.json of igsr, or a folder with one; default: that of the fit which
                        SCENE is of. For COLMAP and transforms.json use: igsr view SCENE --cameras PATH
   --camera N           start at camera N of the capture, from 0; default: 0, where there are cameras
-  --orbit DEG          turn about the scene's centre; with --frames: the number of pictures
+  --orbit DEG          turn about the scene's center; with --frames: the number of pictures
   --up AXIS            up axis: x, y, z, -x, -y or -z; default: from the cameras, else estimated
   --fov DEG            vertical field of view, 5 to 150; default 50
   --near DISTANCE      near plane; default 0.01, or a 20th of a smaller scene's radius
-  --background COLOR   white, black, grey or R,G,B in 0..1; default: the fit's, else black
+  --background COLOR   white, black, gray or R,G,B in 0..1; default: the fit's, else black
 
   --help, --version";
 
-/// What computes the pictures without a window.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+/// Backend that renders without a window.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Backend {
     /// A real GPU if one answers, else the CPU.
+    #[default]
     Auto,
     /// Any adapter, software ones too.
     Gpu,
-    /// The CPU.
     Cpu,
 }
 
-/// The command line.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Default)]
 pub struct Arguments {
-    /// Files and folders to show.
     pub scenes: Vec<PathBuf>,
-    /// File for one picture.
     pub screenshot: Option<PathBuf>,
     /// Folder for pictures of a full turn.
     pub frames: Option<PathBuf>,
-    /// Frames to time.
     pub time: Option<u32>,
-    /// Width and height in pixels.
     pub size: Option<[u32; 2]>,
-    /// What computes.
     pub backend: Backend,
-    /// What draws in the window.
     pub drawing: Drawing,
-    /// File or folder of the capture's cameras.
     pub cameras: Option<PathBuf>,
-    /// Most splats of a scene in levels of detail.
+    /// Maximum number of splats of a scene in levels of detail.
     pub budget: Option<usize>,
     /// Number of the camera to start at.
     pub camera: Option<usize>,
-    /// Degrees about the scene's centre, or a number of pictures.
+    /// Degrees about the scene's center, or a number of pictures.
     pub orbit: Option<f64>,
     /// The up axis, a unit vector.
     pub up: Option<[f64; 3]>,
@@ -91,43 +82,22 @@ pub struct Arguments {
     pub background: Option<[f32; 3]>,
 }
 
-/// What the command line asks for.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Asked {
-    /// Print [`HELP`].
     Help,
-    /// Print the version.
     Version,
-    /// Show or draw.
     Run(Box<Arguments>),
 }
 
-/// Most pictures of a turn.
 const FRAMES_MAX: f64 = 100_000.0;
 
 impl Arguments {
     /// Reads the command line, the program's name left out.
     pub fn parse(words: impl IntoIterator<Item = OsString>) -> Result<Asked> {
-        let mut out = Self {
-            scenes: Vec::new(),
-            screenshot: None,
-            frames: None,
-            time: None,
-            size: None,
-            backend: Backend::Auto,
-            drawing: Drawing::Auto,
-            cameras: None,
-            budget: None,
-            camera: None,
-            orbit: None,
-            up: None,
-            fov: None,
-            near: None,
-            background: None,
-        };
+        let mut out = Self::default();
         let mut parser = lexopt::Parser::from_args(words);
         let wrong = |error: lexopt::Error| {
-            Error::argument("splat-view", format!("{error}; splat-view --help lists what it takes"))
+            Error::argument("splat-view", format!("{error}; see splat-view --help"))
         };
         while let Some(word) = parser.next().map_err(wrong)? {
             let name = match word {
@@ -174,7 +144,6 @@ impl Arguments {
         Ok(Asked::Run(Box::new(out)))
     }
 
-    /// Whether no window is to open.
     pub fn is_headless(&self) -> bool {
         self.screenshot.is_some() || self.frames.is_some() || self.time.is_some()
     }
@@ -184,7 +153,7 @@ impl Arguments {
         if kinds.iter().filter(|&&given| given).count() > 1 {
             return Err(Error::argument(
                 "--screenshot, --frames, --time",
-                "exclude each other; give one of them",
+                "cannot be combined; give one of them",
             ));
         }
         if self.is_headless() && self.scenes.is_empty() {
@@ -194,7 +163,7 @@ impl Arguments {
             return Err(Error::argument(
                 "SCENE",
                 format!(
-                    "must be one without a window, not {}; leave {} out",
+                    "must be a single scene without a window, not {}; leave {} out",
                     self.scenes.len(),
                     self.scenes[1].display()
                 ),
@@ -203,7 +172,8 @@ impl Arguments {
         if self.drawing != Drawing::Auto && self.is_headless() && self.time.is_none() {
             return Err(Error::argument(
                 "--draw",
-                "applies to the window and to --time; pictures without a window are always rasterized",
+                "applies to the window and to --time; pictures without a window are always \
+                 rasterized",
             ));
         }
         let ending = |path: &PathBuf| path.extension().map(|e| e.to_ascii_lowercase());
@@ -288,9 +258,9 @@ fn axis(value: &OsString) -> Result<[f64; 3]> {
 
 fn color(value: &OsString) -> Result<[f32; 3]> {
     let text = text("--background", value)?;
-    let named = [("black", 0.0), ("white", 1.0), ("grey", 0.5)];
-    if let Some((_, grey)) = named.iter().find(|(name, _)| *name == text) {
-        return Ok([*grey; 3]);
+    let named = [("black", 0.0), ("white", 1.0), ("gray", 0.5)];
+    if let Some((_, gray)) = named.iter().find(|(name, _)| *name == text) {
+        return Ok([*gray; 3]);
     }
     let parts: Vec<f32> = text.split(',').filter_map(|part| part.trim().parse().ok()).collect();
     match parts[..] {
@@ -298,7 +268,7 @@ fn color(value: &OsString) -> Result<[f32; 3]> {
         _ => Err(Error::argument(
             "--background",
             format!(
-                "must be white, black, grey or three numbers in 0..1 such as 0.2,0.2,0.2, not \
+                "must be white, black, gray or three numbers in 0..1 such as 0.2,0.2,0.2, not \
                  {text:?}"
             ),
         )),

@@ -1,5 +1,4 @@
-// Draws each splat as a quad that is blended over the others, back to front. Comes after splat_render's
-// shared.wgsl, which has the Splat2d that the project stage writes.
+// Draws each splat as a quad, blended back to front. Follows splat_render's shared.wgsl.
 
 struct Style {
     // Rows of the world-to-camera matrix.
@@ -21,7 +20,7 @@ const ELLIPSES = 2u;
 const DEPTH = 3u;
 const NORMALS = 4u;
 
-// Where an ellipse ends, in standard deviations.
+// Radius of an ellipse's edge, in standard deviations.
 const ELLIPSE = 1.5;
 
 @group(0) @binding(0) var<uniform> style: Style;
@@ -31,7 +30,7 @@ const ELLIPSE = 1.5;
 
 struct Corner {
     @builtin(position) position: vec4<f32>,
-    // Place relative to the centre, in standard deviations; for points in radii.
+    // Place relative to the center, in standard deviations; for points in radii.
     @location(0) whitened: vec2<f32>,
     @location(1) @interpolate(flat) color: vec3<f32>,
     @location(2) @interpolate(flat) opacity: f32,
@@ -110,7 +109,7 @@ fn shade(in: Corner) -> @location(0) vec4<f32> {
         if square > ELLIPSE * ELLIPSE {
             discard;
         }
-        // Darker towards the rim, so that neighbours can be told apart.
+        // Darker towards the rim, to separate neighbors.
         return vec4(in.color * (1.0 - 0.7 * square / (ELLIPSE * ELLIPSE)), 1.0);
     }
     let alpha = min(in.opacity * exp(-0.5 * square), ALPHA_MAX);

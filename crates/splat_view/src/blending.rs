@@ -1,5 +1,4 @@
-//! Draws splats onto a canvas with the blending unit: splat_render projects and sorts them, and each is a
-//! quad, back to front.
+//! Draws splats onto a canvas with the blending unit, as quads, back to front.
 
 use bytemuck::{Pod, Zeroable};
 use splat_render::gpu::{Gpu, ResidentSplats, ResidentView, shared_wgsl};
@@ -26,7 +25,6 @@ struct Style {
     padding: [f32; 2],
 }
 
-/// A model on the device.
 #[derive(Debug)]
 pub struct Drawable {
     resident: ResidentSplats,
@@ -37,7 +35,6 @@ pub struct Drawable {
 }
 
 impl Drawable {
-    /// Its splats.
     pub fn splats(&self) -> &ResidentSplats {
         &self.resident
     }
@@ -53,12 +50,10 @@ impl Drawable {
     }
 }
 
-/// The pipeline.
 #[derive(Debug)]
 pub struct Blending(Pipeline);
 
 impl Blending {
-    /// Compiles it.
     pub fn new(gpu: &Gpu) -> Self {
         let storage = |binding| storage_layout(binding, wgpu::ShaderStages::VERTEX);
         Self(Pipeline::new(
@@ -81,7 +76,6 @@ impl Blending {
         ))
     }
 
-    /// Copies a model to the device.
     pub fn upload(&self, gpu: &Gpu, file: &SplatFile) -> Result<Drawable> {
         let resident = ResidentSplats::new(gpu, &file.splats.params(file.splats.sh_degree))?;
         let style = uniform::<Style>(gpu);
@@ -97,8 +91,8 @@ impl Blending {
         })
     }
 
-    /// Records a model's picture onto columns `begin..end` of a canvas; depths are divided by `unit`. One
-    /// picture per model and submission.
+    /// Draws a model onto columns `begin..end`; depths are in `depth_unit`. Once per model and
+    /// submission.
     pub fn record(
         &self,
         gpu: &Gpu,
@@ -154,7 +148,6 @@ impl Blending {
 }
 
 impl Settings {
-    /// Whether canvases hold depths.
     pub fn is_depth(&self) -> bool {
         self.display == Display::Depth
     }

@@ -9,11 +9,10 @@ use crate::viewpoint::Viewpoint;
 /// Marked places, in their order.
 #[derive(Debug, Clone, Default)]
 pub struct CameraPath {
-    /// The places.
     pub keys: Vec<Viewpoint>,
 }
 
-/// Cubic through b and c, with the slopes of their neighbours (Catmull and Rom 1974).
+/// Cubic through b and c, with the slopes of their neighbors (Catmull and Rom 1974).
 fn cubic(a: DVec3, b: DVec3, c: DVec3, d: DVec3, t: f64) -> DVec3 {
     let (t2, t3) = (t * t, t * t * t);
     0.5 * (2.0 * b
@@ -23,8 +22,7 @@ fn cubic(a: DVec3, b: DVec3, c: DVec3, d: DVec3, t: f64) -> DVec3 {
 }
 
 impl CameraPath {
-    /// Number of pictures of the whole path, with `between` from each place to the next, both ends
-    /// included.
+    /// Number of pictures of the path, with `between` from each place to the next, ends included.
     pub fn pictures(&self, between: u32) -> u32 {
         match self.keys.len() {
             0 => 0,
@@ -32,7 +30,7 @@ impl CameraPath {
         }
     }
 
-    /// The view `t` places after the first; None if there are no places.
+    /// The view at parameter `t`; t = k is place k. None without places.
     pub fn at(&self, t: f64) -> Option<Viewpoint> {
         let last = self.keys.len().checked_sub(1)?;
         let segment = (t.max(0.0) as usize).min(last.saturating_sub(1));
@@ -53,9 +51,7 @@ pub struct Recording {
     path: CameraPath,
     /// Pictures from each place to the next, as set at the start.
     between: u32,
-    /// Folder of the pictures.
     pub folder: PathBuf,
-    /// Number of the next picture.
     pub next: u32,
 }
 
@@ -65,7 +61,6 @@ impl Recording {
         Self { path: path.clone(), between: between.max(1), folder, next: 0 }
     }
 
-    /// Pictures in all.
     pub fn total(&self) -> u32 {
         self.path.pictures(self.between)
     }
@@ -86,7 +81,7 @@ mod tests {
     }
 
     #[test]
-    fn a_recording_goes_on_when_its_places_are_forgotten_and_ends_after_its_last() {
+    fn a_recording_ends_after_its_last_place() {
         let mut path = CameraPath { keys: vec![place(0.0), place(1.0)] };
         let mut recording = Recording::new(&path, 4, PathBuf::new());
         path.keys.clear();

@@ -8,7 +8,7 @@ struct Place {
 }
 
 @group(0) @binding(0) var<uniform> place: Place;
-// Colour without background, and final transmittance.
+// Color without background, and final transmittance.
 @group(0) @binding(1) var<storage, read> picture: array<vec4<f32>>;
 
 @vertex

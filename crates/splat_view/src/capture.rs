@@ -1,6 +1,6 @@
-//! The cameras of a capture, from the one file this program reads: `cameras.json` as igsr writes it.
+//! The cameras of a capture, from igsr's `cameras.json`.
 //!
-//! The layout is that of nerfstudio's `transforms.json` with every field given for every photo:
+//! The layout is nerfstudio's `transforms.json` with every field given for every photo:
 //!
 //! ```json
 //! {
@@ -16,9 +16,9 @@
 //! }
 //! ```
 //!
-//! `file_path` is the photo's name, and its path from the file's folder where the photo is there. Sizes,
-//! focal lengths and principal points are in pixels. `transform_matrix` is camera-to-world, row by row,
-//! in OpenGL axes (x right, y up, z backward). Other fields are ignored.
+//! `file_path` is the photo's name, or its path from the file's folder if the photo is there. Sizes, focal
+//! lengths and principal points are in pixels. `transform_matrix` is camera-to-world, row by row, in OpenGL
+//! axes (x right, y up, z backward). Other fields are ignored.
 
 use std::io::Read;
 use std::path::{Path, PathBuf};
@@ -28,20 +28,17 @@ use serde::Deserialize;
 use splat_render::io::open_file;
 use splat_render::{Camera, Error, Result};
 
-/// The file's name in a folder.
 const NAME: &str = "cameras.json";
 /// Largest file that is read, in bytes: some 100,000 cameras as igsr writes them.
 const FILE_MAX: u64 = 64 << 20;
-/// What to do about cameras in another format.
+/// Hint for cameras in another format.
 const OTHERS: &str = "igsr view shows other captures too (COLMAP, transforms.json), and igsr export \
                       --format transforms rewrites them for splat-view";
 
-/// A photo's camera.
 #[derive(Debug, Clone)]
 pub struct CaptureCamera {
-    /// The photo's name in the capture.
     pub name: String,
-    /// The photo, where it is there.
+    /// The photo, if the file exists.
     pub photo: Option<PathBuf>,
     /// The pinhole camera, in world coordinates.
     pub camera: Camera,
@@ -90,8 +87,7 @@ impl Frame {
     }
 }
 
-/// Reads the cameras in a file, or in a folder's `cameras.json`, in the file's order. Every camera that
-/// is returned is valid.
+/// Reads the cameras of a file or of a folder's `cameras.json`, in order; all are valid.
 pub fn read_cameras(path: &Path) -> Result<Vec<CaptureCamera>> {
     let Some(file) = find_cameras(path) else {
         let reason = match path.is_dir() {
@@ -105,7 +101,7 @@ pub fn read_cameras(path: &Path) -> Result<Vec<CaptureCamera>> {
     let size = opened.metadata().map_err(unreadable)?.len();
     if size > FILE_MAX {
         let reason =
-            format!("is {size} bytes, more than the {FILE_MAX} that are read; name fewer cameras");
+            format!("is {size} bytes, more than the limit of {FILE_MAX}; give fewer cameras");
         return Err(Error::file(&file, reason));
     }
     let mut bytes = Vec::new();

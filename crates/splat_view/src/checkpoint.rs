@@ -16,10 +16,9 @@ use zip::{CompressionMethod, ZipArchive};
 /// Longest array header that is read, bytes.
 const HEADER_MAX: usize = 4096;
 
-/// Reads the splats of a checkpoint.
 pub fn read_checkpoint(path: &Path) -> Result<SplatFile> {
     let bad = |what: String| {
-        Error::file(path, format!("is no checkpoint of igsr fit ({what}); give its scene.ply"))
+        Error::file(path, format!("is not a checkpoint of igsr fit ({what}); give its scene.ply"))
     };
     let file = open_file(path)?;
     let mut archive = ZipArchive::new(file).map_err(|e| bad(e.to_string()))?;
@@ -56,7 +55,6 @@ pub fn read_checkpoint(path: &Path) -> Result<SplatFile> {
 
 type Reason = String;
 
-/// A member's shape and bytes.
 fn read_member<R: Read + Seek>(
     archive: &mut ZipArchive<R>,
     name: &str,
@@ -71,7 +69,7 @@ fn read_member<R: Read + Seek>(
     let mut head = [0u8; 10];
     member.read_exact(&mut head).map_err(|e| format!("{name}: {e}"))?;
     if &head[..8] != b"\x93NUMPY\x01\x00" {
-        return Err(format!("{name} is no array that can be read"));
+        return Err(format!("{name} is not a readable array"));
     }
     let length = usize::from(u16::from_le_bytes([head[8], head[9]]));
     if length > HEADER_MAX {

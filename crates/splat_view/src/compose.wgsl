@@ -4,7 +4,7 @@ struct Look {
     background: vec3<f32>,
     // First pixel column of the second canvas.
     divider: f32,
-    // 1 where the canvases hold depths, in units of which `depth_near` and `depth_far` count.
+    // 1 if the canvases hold depths, shown from `depth_near` to `depth_far`.
     is_depth: u32,
     depth_near: f32,
     depth_far: f32,

@@ -10,13 +10,12 @@ use crate::pipelines::{Pipeline, uniform, uniform_layout};
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub struct Look {
-    /// Background, RGB in 0..1.
     pub background: [f32; 3],
     /// First pixel column of the second canvas.
     pub divider: f32,
-    /// 1 where the canvases hold depths.
+    /// 1 if the canvases hold depths.
     pub is_depth: u32,
-    /// Depths at the ends of the colour map, in the canvases' unit.
+    /// Depths at the ends of the color map, in the canvases' unit.
     pub depth_range: [f32; 2],
     /// Fills the struct up to its size in WGSL.
     pub padding: f32,
@@ -25,22 +24,18 @@ pub struct Look {
 /// Textures that splats are drawn to, for one model or two side by side.
 #[derive(Debug)]
 pub struct Canvases {
-    /// Width and height in pixels.
     pub size: [u32; 2],
     /// Both are the same if there is one model.
     pub textures: [wgpu::Texture; 2],
-    /// Views of `textures`.
     pub views: [wgpu::TextureView; 2],
     look: wgpu::Buffer,
     bindings: wgpu::BindGroup,
 }
 
-/// The pipeline, for targets of one format.
 #[derive(Debug)]
 pub struct Composing(Pipeline);
 
 impl Composing {
-    /// Compiles it.
     pub fn new(gpu: &Gpu, format: wgpu::TextureFormat) -> Self {
         let texture = |binding| wgpu::BindGroupLayoutEntry {
             binding,
@@ -89,7 +84,6 @@ impl Composing {
         Canvases { size, textures, views, look, bindings }
     }
 
-    /// Records the composition.
     pub fn record(
         &self,
         gpu: &Gpu,

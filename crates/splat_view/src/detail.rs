@@ -7,23 +7,20 @@ use splat_render::io::SplatFile;
 use splat_render::levels::{Choice, Drawn, INDEX, Manifest, Resident, View, choose, coarsest};
 use splat_render::{Camera, Error, Result};
 
-/// Most splats that are held, unless the command line says otherwise.
+/// Default maximum number of splats in memory.
 pub const BUDGET: usize = 1_000_000;
-/// Splats nearer to each other than this, in pixels, are fine enough: finer ones would look worse, as each
-/// covers a part of a pixel and is drawn as large as one.
+/// Distance of splats in pixels that is fine enough; finer ones are drawn too large.
 const FINE: f64 = 1.5;
 
-/// Whether a path is that of a scene in levels of detail.
 pub fn is_in_levels(path: &Path) -> bool {
     path.file_name().is_some_and(|name| name == INDEX)
 }
 
-/// The view from a camera.
 pub fn view(camera: &Camera, near: f32) -> View {
     View { camera: *camera, near: f64::from(near), pixels: FINE }
 }
 
-/// A scene in levels of detail, and what of it is in memory.
+/// A scene in levels of detail, and its loaded splats.
 #[derive(Debug)]
 pub struct Detail {
     manifest: Manifest,
@@ -53,9 +50,7 @@ impl Detail {
                 0 => Error::file(path, "has no splats; write the levels again"),
                 n => Error::argument(
                     "--budget",
-                    format!(
-                        "of {budget} splats has no room for the coarsest cell, of {n}; give more"
-                    ),
+                    format!("of {budget} splats is less than the coarsest cell's {n}; give more"),
                 ),
             });
         }
@@ -69,12 +64,11 @@ impl Detail {
         (runs.map(|run| run.count).sum(), self.manifest.cells.len())
     }
 
-    /// The most splats that were ever held.
+    /// Largest number of splats ever loaded.
     pub fn most(&self) -> usize {
         self.resident.most
     }
 
-    /// The levels for a view.
     pub fn choose(&self, view: &View) -> Choice {
         choose(&self.manifest, view, self.resident.room())
     }
@@ -90,7 +84,7 @@ impl Detail {
         Some(loaded)
     }
 
-    /// What is there of a choice.
+    /// The loaded part of a choice.
     pub fn drawn(&self, choice: &Choice) -> Drawn {
         self.resident.drawn(&self.manifest, choice)
     }

@@ -4,21 +4,17 @@
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[repr(u32)]
 pub enum Display {
-    /// As they are rendered.
     #[default]
     Splats,
-    /// A dot for each.
     Points,
     /// Each as a solid ellipse, 1.5 standard deviations wide.
     Ellipses,
-    /// Expected depth in false colour.
     Depth,
     /// Each splat's shortest axis, in camera axes.
     Normals,
 }
 
 impl Display {
-    /// All of them, with their labels.
     pub const ALL: [(Self, &str); 5] = [
         (Self::Splats, "Splats"),
         (Self::Points, "Points"),
@@ -28,20 +24,17 @@ impl Display {
     ];
 }
 
-/// What draws splats as they are rendered; the other displays are the blending unit's.
+/// Renderer of the display `Splats`; blending draws the remaining displays.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Drawing {
-    /// The rasterizer on software adapters, where it is the faster one, else the blending unit.
+    /// The rasterizer on software adapters, for which it is faster, else blending.
     #[default]
     Auto,
-    /// splat_render's rasterizer.
     Rasterizer,
-    /// The blending unit.
     Blending,
 }
 
 impl Drawing {
-    /// All of them, with their labels.
     pub const ALL: [(Self, &str); 3] =
         [(Self::Auto, "auto"), (Self::Rasterizer, "rasterize"), (Self::Blending, "blend")];
 }
@@ -49,9 +42,7 @@ impl Drawing {
 /// How a picture is drawn.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Settings {
-    /// What is shown.
     pub display: Display,
-    /// What draws it.
     pub drawing: Drawing,
     /// Highest SH degree that is evaluated.
     pub sh_degree: u32,
@@ -59,7 +50,6 @@ pub struct Settings {
     pub fov: f64,
     /// Near plane, world units.
     pub near: f32,
-    /// Behind the splats, RGB in 0..1.
     pub background: [f32; 3],
     /// Radius of points in pixels.
     pub radius: f32,

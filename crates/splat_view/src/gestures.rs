@@ -16,7 +16,7 @@ const SPEED: f64 = 0.8;
 /// Factor of the speed with Shift.
 const FAST: f64 = 4.0;
 /// Longest time in seconds that one movement by key covers: nothing jumps after a pause.
-const LONGEST: f32 = 0.1;
+const KEY_STEP_MAX: f32 = 0.1;
 
 /// Moves the camera by the pointer. `size` is the picture's, in pixels.
 pub fn pointer(
@@ -94,7 +94,7 @@ pub fn keys(viewer: &mut Viewer, ui: &Ui, size: [u32; 2], actions: &mut Vec<Acti
             [pair(Key::A, Key::D), pair(Key::Q, Key::E), pair(Key::S, Key::W)],
             [pair(Key::ArrowLeft, Key::ArrowRight), pair(Key::ArrowDown, Key::ArrowUp)],
             i.modifiers.shift,
-            f64::from(i.stable_dt.min(LONGEST)),
+            f64::from(i.stable_dt.min(KEY_STEP_MAX)),
             !i.modifiers.command && !i.modifiers.alt,
         )
     });
@@ -202,7 +202,7 @@ mod tests {
             let mut viewer = Viewer::new(Settings::default(), String::new());
             viewer.viewpoint = Viewpoint::framing(glam::DVec3::ZERO, 1.0, viewer.up, 1.0);
             let mut hand = Self { context: Context::default(), viewer, time: 0.0 };
-            // egui knows what lies under the pointer from the frame before.
+            // egui hit-tests against the previous frame.
             hand.frame(Vec::new());
             hand
         }
@@ -233,7 +233,7 @@ mod tests {
             actions
         }
 
-        /// Fingers as egui-winit tells of them: the first is a mouse, too. One after the other comes down.
+        /// Finger events as egui-winit sends them, one after another: the first finger is a mouse, too.
         fn fingers(&mut self, phase: TouchPhase, places: &[Pos2]) {
             if phase == TouchPhase::Start && places.len() > 1 {
                 self.fingers(phase, &places[..1]);
@@ -260,7 +260,7 @@ mod tests {
         }
     }
 
-    /// Where a point of the world is in the picture.
+    /// Pixel of a point of the world.
     fn seen(viewpoint: &Viewpoint, point: glam::DVec3) -> [f64; 2] {
         let camera = viewpoint.camera(SIZE, Settings::default().fov);
         let p = camera.viewmat.transform_point3(point);
@@ -268,7 +268,7 @@ mod tests {
     }
 
     #[test]
-    fn one_finger_turns_and_two_pan_what_lies_at_the_middle_with_them() {
+    fn one_finger_turns_and_two_pan() {
         let mut hand = Hand::new();
         let before = hand.viewer.viewpoint;
         let at = |x: f32, y: f32| pos2(x, y);
@@ -297,7 +297,7 @@ mod tests {
     }
 
     #[test]
-    fn fingers_on_the_panel_are_the_panel_s() {
+    fn fingers_on_the_panel_do_not_move_the_camera() {
         let mut hand = Hand::new();
         let before = hand.viewer.viewpoint;
         hand.fingers(TouchPhase::Start, &[pos2(350.0, 100.0), pos2(350.0, 140.0)]);
@@ -310,7 +310,7 @@ mod tests {
     }
 
     #[test]
-    fn fingers_that_part_come_nearer_as_much_and_so_do_pinches_and_the_wheel() {
+    fn pinches_and_the_wheel_zoom() {
         let mut hand = Hand::new();
         let before = hand.viewer.viewpoint;
         let apart = |half: f32| [pos2(200.0 - half, 150.0), pos2(200.0 + half, 150.0)];

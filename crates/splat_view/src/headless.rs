@@ -22,12 +22,10 @@ use crate::stage_times::STAGES;
 use crate::start::no_levels;
 use crate::viewpoint::{Viewpoint, fitted, relative_to};
 
-/// Default size of pictures.
 const SIZE: [u32; 2] = [1280, 720];
 
-/// What the pictures are of.
 struct Scene {
-    /// Its splats are those for the camera of the last picture, where it is in levels of detail.
+    /// If in levels of detail, holds the splats for the last picture's camera.
     model: Model,
     camera: Camera,
     viewpoint: Viewpoint,
@@ -35,7 +33,6 @@ struct Scene {
     up: glam::DVec3,
 }
 
-/// Does what the command line asks for without a window.
 pub fn run(arguments: &Arguments) -> Result<()> {
     let mut scene = Scene::new(arguments)?;
     if let Some(frames) = arguments.time {
@@ -65,9 +62,9 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     Ok(())
 }
 
-/// Makes a folder for pictures; one that holds anything is refused: those of two turns would mix.
+/// Makes a folder for pictures. A folder with files is refused, so that two turntables do not mix.
 fn make_empty(folder: &Path) -> Result<()> {
-    let unwritable = |e| Error::file(folder, format!("cannot be made ({e}); name another"));
+    let unwritable = |e| Error::file(folder, format!("cannot be created ({e}); name another"));
     std::fs::create_dir_all(folder).map_err(unwritable)?;
     if std::fs::read_dir(folder).map_err(unwritable)?.next().is_some() {
         return Err(Error::file(folder, "is not empty; name a new folder for --frames"));
@@ -84,7 +81,7 @@ fn stages(backend: Backend) -> Result<Arc<dyn Stages<f32>>> {
             Ok(gpu) => Ok(gpu),
             Err(error) => {
                 match error {
-                    Error::NoAdapter(_) => eprintln!("No GPU answers; the CPU draws."),
+                    Error::NoAdapter(_) => eprintln!("No GPU was found; the CPU draws."),
                     error => eprintln!("{error}. The CPU draws."),
                 }
                 Ok(Arc::new(Cpu))
@@ -126,11 +123,11 @@ impl Scene {
         Ok(Self { model, camera, viewpoint, settings, up })
     }
 
-    /// Reads what a camera needs of a scene in levels of detail, and says how much that is.
+    /// Reads a camera's splats of a scene in levels of detail, and reports their number.
     fn look(&mut self, camera: &Camera) -> Result<()> {
         let Some(detail) = &mut self.model.detail else { return Ok(()) };
         let choice = detail.choose(&view(camera, self.settings.near));
-        // The copy of the last picture would be held beside what is read.
+        // Free the last picture's copy before reading.
         self.model.file = SplatFile::default();
         while let Some(loaded) = detail.load_next(&choice) {
             loaded?;
@@ -147,7 +144,7 @@ impl Scene {
         Ok(())
     }
 
-    /// The camera, turned by degrees about the scene's centre.
+    /// The camera, turned by degrees about the scene's center.
     fn turned(&self, degrees: f64) -> Camera {
         let mut viewpoint = self.viewpoint;
         viewpoint.orbit(degrees.to_radians(), 0.0, self.up);
@@ -178,8 +175,7 @@ fn write(path: &Path, image: &Image<f32>) -> Result<()> {
     write_png(path, [image.width, image.height], &to_bytes(image))
 }
 
-/// Draws frames as the window does. Prints the time of each stage, and the picture's error against the
-/// rasterizer's.
+/// Times frames as the window draws them, and compares the picture with the rasterizer's.
 fn time(scene: &Scene, frames: u32) -> Result<()> {
     let gpu = Arc::new(Gpu::new(true)?);
     check_size(&gpu, [scene.camera.width, scene.camera.height])?;
@@ -225,12 +221,11 @@ fn time(scene: &Scene, frames: u32) -> Result<()> {
     println!("median milliseconds of {frames} frames at {width}x{height}");
     for (stage, name) in STAGES.iter().enumerate() {
         let took: Vec<f32> = stages.iter().map(|times| times[stage]).collect();
-        // A second model and the panel are the window's alone.
         if took.iter().any(|&ms| ms > 0.0) {
             println!("{name:>12} {:9.2}", median(took));
         }
     }
-    // Submission, and what the timestamps leave out.
+    // Submission and other time outside the timestamps.
     let rest = whole.iter().zip(&stages).map(|(whole, times)| whole - times.iter().sum::<f32>());
     println!("{:>12} {:9.2}", "rest", median(rest.collect()));
     let least = whole.iter().copied().fold(f32::INFINITY, f32::min);

@@ -42,9 +42,8 @@ use std::ffi::OsString;
 use arguments::{Arguments, Asked, HELP};
 use splat_render::Result;
 
-/// Does what a command line asks for, the program's name left out, and prints errors.
-///
-/// Returns the exit status. A window must be opened by the process's first thread.
+/// Runs a command line without the program's name; prints errors and returns the exit status. Only the
+/// process's first thread may open a window.
 pub fn run(words: impl IntoIterator<Item = OsString>) -> u8 {
     match asked(words) {
         Ok(()) => 0,

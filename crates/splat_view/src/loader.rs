@@ -13,11 +13,9 @@ use crate::sources::{Stamp, stamp};
 pub struct Loaded {
     /// The side it is for, 0 or 1.
     pub side: usize,
-    /// The file.
     pub path: PathBuf,
     /// The file's stamp before it was read.
     pub stamp: Option<Stamp>,
-    /// The model.
     pub model: Result<Model>,
 }
 
@@ -28,18 +26,15 @@ pub struct Loader {
     receiver: Receiver<Loaded>,
     /// The file that each side waits for.
     waits: [Option<PathBuf>; 2],
-    /// Most splats of a scene in levels of detail.
     budget: Option<usize>,
 }
 
 impl Loader {
-    /// Nothing to read yet.
     pub fn new(budget: Option<usize>) -> Self {
         let (sender, receiver) = channel();
         Self { sender, receiver, waits: [None, None], budget }
     }
 
-    /// Whether a side waits for a model.
     pub fn is_busy(&self, side: usize) -> bool {
         self.waits[side].is_some()
     }
@@ -51,13 +46,13 @@ impl Loader {
         std::thread::spawn(move || {
             let stamp = stamp(&path);
             let model = Model::read(&path, budget);
-            // Nobody receives once the window is closed.
+            // The receiver is gone once the window is closed.
             let _ = sender.send(Loaded { side, path, stamp, model });
             wake();
         });
     }
 
-    /// Drops what is being read for a side: it will not be shown.
+    /// Drops the pending read for a side: it will not be shown.
     pub fn forget(&mut self, side: usize) {
         self.waits[side] = None;
     }
@@ -79,7 +74,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_was_forgotten_while_it_was_read_is_not_shown() {
+    fn a_file_removed_while_it_is_read_is_not_shown() {
         let mut loader = Loader::new(None);
         let (there, done) = channel();
         for (side, name) in [(1, "no such file"), (0, "nor this")] {

@@ -14,26 +14,23 @@ const FAINT_LOGIT: f32 = -2.2;
 /// Number of splats that the extent is computed from.
 const SAMPLES: usize = 100_000;
 
-/// A scene in memory.
 #[derive(Debug)]
 pub struct Model {
-    /// Its splats and their origin.
     pub file: SplatFile,
-    /// Centre of the visible splats, in world coordinates.
+    /// Center of the visible splats, in world coordinates.
     pub center: DVec3,
-    /// Radius about the centre: of 90% of the visible splats, at most four times that of 50%.
+    /// Radius with 90 % of the visible splats, at most four times the radius with 50 %.
     pub radius: f64,
-    /// What was ignored in reading, one message each.
+    /// Messages about ignored content.
     pub notes: Vec<String>,
-    /// Where more of it lies: `file` is the part of a scene in levels of detail that is drawn.
+    /// For a scene in levels of detail; `file` is then its drawn part.
     pub detail: Option<Detail>,
-    /// Splats that the whole scene has, if that is not what `file` has.
+    /// Number of splats of the whole scene, if `file` has another.
     pub whole: Option<usize>,
 }
 
 impl Model {
-    /// Reads a splat file, a checkpoint of a fit, or a scene in levels of detail, of which no more splats
-    /// than a budget are held.
+    /// Reads a splat file, a fit's checkpoint, or at most `budget` splats of a scene in levels.
     pub fn read(path: &Path, budget: Option<usize>) -> Result<Self> {
         if is_in_levels(path) {
             let (detail, file) = Detail::open(path, budget.unwrap_or(BUDGET))?;
@@ -80,7 +77,7 @@ fn quantile(values: &mut [f64], part: f64) -> f64 {
     *values.select_nth_unstable_by(at, f64::total_cmp).1
 }
 
-/// Centre and radius. Medians, because captures have a few splats very far out.
+/// Center and radius. Medians, because captures have a few splats very far out.
 fn extent(file: &SplatFile) -> (DVec3, f64) {
     let step = file.splats.len().div_ceil(SAMPLES).max(1);
     let finite = (0..file.splats.len()).step_by(step).filter(|&i| is_finite(file, i));

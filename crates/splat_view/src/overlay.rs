@@ -1,4 +1,4 @@
-//! What is painted over the splats: the capture's cameras, a photo, the divider.
+//! Painted over the splats: the capture's cameras, a photo, the divider.
 
 use egui::{Align2, Color32, FontId, Pos2, Rect, Stroke, TextureHandle, Ui};
 use glam::DVec3;
@@ -68,7 +68,6 @@ pub fn cameras(
     }
 }
 
-/// Lays a photo over the picture from its camera.
 pub fn photo(viewer: &Viewer, ui: &Ui, size: [u32; 2], texture: &TextureHandle) {
     let Some(at) = viewer.at_camera.and_then(|i| viewer.cameras.get(i)) else { return };
     if viewer.photo_strength <= 0.0 {
@@ -89,10 +88,8 @@ pub fn photo(viewer: &Viewer, ui: &Ui, size: [u32; 2], texture: &TextureHandle) 
     ui.painter().image(texture.id(), rect, whole, tint);
 }
 
-/// Moves the divider between two models while the pointer holds it; returns whether it does.
-///
-/// The place where the button went down decides. egui itself takes the pointer's place at the end of
-/// the frame, which on a slow device is past the divider already.
+/// Moves the divider during a drag; returns whether it is dragged. The press position decides: egui's
+/// position, at the end of the frame, may be past the divider.
 pub fn hold_divider(viewer: &mut Viewer, ui: &Ui) -> bool {
     if !viewer.compares() {
         viewer.holds_divider = false;

@@ -16,7 +16,6 @@ use crate::stage_times::{
     Stamps, Written,
 };
 
-/// Format of pictures that are read back.
 const PICTURE: wgpu::TextureFormat = wgpu::TextureFormat::Rgba8Unorm;
 /// Alignment of the rows of a copied texture, bytes.
 const ROW: u32 = wgpu::COPY_BYTES_PER_ROW_ALIGNMENT;
@@ -35,30 +34,26 @@ pub fn check_size(gpu: &Gpu, [width, height]: [u32; 2]) -> Result<()> {
     Err(Error::argument(
         "--size",
         format!(
-            "frames have sides up to {most} on {}, not {width}x{height}; give smaller ones",
+            "sides of frames are up to {most} on {}, not {width}x{height}; give smaller ones",
             gpu.name()
         ),
     ))
 }
 
-/// What a frame shows.
 #[derive(Debug, Clone, Copy)]
 pub struct Shot<'a> {
     /// The camera, with the size of the picture.
     pub camera: Camera,
-    /// How splats are drawn.
     pub settings: &'a Settings,
     /// The model; the left one if there are two.
     pub left: Option<&'a Drawable>,
-    /// The other, on the right.
     pub right: Option<&'a Drawable>,
-    /// Where the right one begins, as a fraction of the width.
+    /// Start of the right model, as a fraction of the width.
     pub divider: f32,
-    /// Depths at the ends of the colour map, world units.
+    /// Depths at the ends of the color map, world units.
     pub depths: [f32; 2],
 }
 
-/// Pipelines and canvases on one device.
 #[derive(Debug)]
 pub struct Painter {
     gpu: Arc<Gpu>,
@@ -69,12 +64,10 @@ pub struct Painter {
     canvases: Option<Canvases>,
     /// The rasterizer's buffers for a canvas; both sides use them in turn.
     buffers: Option<PictureBuffers>,
-    /// Times of the frames shown.
     pub times: StageTimes,
 }
 
 impl Painter {
-    /// A painter for targets of a format.
     pub fn new(gpu: Arc<Gpu>, format: wgpu::TextureFormat) -> Result<Self> {
         let painter = Self {
             blending: Blending::new(&gpu),
@@ -90,7 +83,6 @@ impl Painter {
         Ok(painter)
     }
 
-    /// Copies a model to the device.
     pub fn upload(&self, file: &SplatFile) -> Result<Drawable> {
         self.blending.upload(&self.gpu, file)
     }
@@ -112,7 +104,6 @@ impl Painter {
         Ok(written)
     }
 
-    /// Where egui's pass writes its timestamps.
     pub fn panel_stamps(&self) -> Option<wgpu::RenderPassTimestampWrites<'_>> {
         self.times.stamps(PANEL).render(0)
     }
@@ -146,7 +137,7 @@ impl Painter {
         Ok(rows.flat_map(|row| row[..4 * width as usize].iter().copied()).collect())
     }
 
-    /// Expected depth at a pixel in world units; None where nothing is.
+    /// Expected depth at a pixel in world units; None for empty pixels.
     pub fn depth_at(&mut self, shot: &Shot<'_>, pixel: [u32; 2]) -> Result<Option<f64>> {
         let settings = Settings { display: Display::Depth, ..*shot.settings };
         let shot = Shot { settings: &settings, ..*shot };
@@ -162,7 +153,7 @@ impl Painter {
         let data = self.gpu.read(&[(&readable, 8)])?;
         let texel: [u16; 4] = bytemuck::pod_read_unaligned(&data[0]);
         let [depth, .., alpha] = texel.map(|bits| f16::from_bits(bits).to_f64());
-        // Where less than half is opaque, nothing can be made out.
+        // Pixels that are less than half opaque count as empty.
         Ok((alpha > 0.5).then(|| depth / alpha * f64::from(unit(&shot))))
     }
 
@@ -193,7 +184,6 @@ impl Painter {
         Ok(())
     }
 
-    /// Whether the rasterizer is to draw.
     fn rasterizes(&self, settings: &Settings) -> bool {
         settings.display == Display::Splats
             && match settings.drawing {

@@ -1,4 +1,4 @@
-//! The panel beside the scene: settings, cameras, files, statistics.
+//! The side panel: settings, cameras, files, statistics.
 
 use egui::{ComboBox, Panel, ScrollArea, Slider, SliderClamping, Ui};
 use glam::DVec3;
@@ -8,7 +8,6 @@ use crate::sources::label;
 use crate::stage_times::{SECOND, STAGES};
 use crate::viewer::{Action, Moving, Viewer};
 
-/// Up axes to choose from.
 const AXES: [(DVec3, &str); 6] = [
     (DVec3::NEG_Y, "-y"),
     (DVec3::Y, "y"),
@@ -55,7 +54,7 @@ pub fn panel(
     });
 }
 
-/// Notes at the panel's foot, where no list pushes them out of sight.
+/// Notes at the panel's foot, so that lists do not push them out of sight.
 fn notes(viewer: &Viewer, ui: &mut Ui) {
     if viewer.notes.texts().next().is_none() {
         return;
@@ -256,7 +255,7 @@ mod tests {
     use crate::painter::Painter;
     use crate::viewer::Shown;
 
-    /// The settings after two frames in which nobody touches the panel.
+    /// The settings after two frames without input on the panel.
     fn untouched(mut viewer: Viewer) -> Settings {
         let context = Context::default();
         for _ in 0..2 {
@@ -279,7 +278,7 @@ mod tests {
     }
 
     #[test]
-    fn the_sh_degree_outlasts_a_model_of_a_lower_one() {
+    fn a_lower_model_keeps_the_chosen_sh_degree() {
         let gpu = Arc::new(Gpu::new(true).expect("an adapter, a software one will do"));
         let painter = Painter::new(gpu, wgpu::TextureFormat::Rgba8Unorm).expect("a painter");
         let splats = SplatArrays {

@@ -14,12 +14,10 @@ const FILE_MAX: u64 = 256 << 20;
 /// Longest side that is read, pixels.
 const SIDE_MAX: usize = 16_384;
 
-/// An 8-bit picture.
 #[derive(Debug, Clone)]
 pub struct Photo {
-    /// Width and height in pixels.
     pub size: [usize; 2],
-    /// RGBA, row-major, colours not multiplied by alpha.
+    /// RGBA, row-major, colors not multiplied by alpha.
     pub rgba: Vec<u8>,
 }
 
@@ -49,7 +47,7 @@ impl Photo {
                     for pixel in self.rgba[from..from + 4 * columns.len()].chunks_exact(4) {
                         let alpha = u64::from(pixel[3]);
                         alphas += alpha;
-                        // Weighted by alpha: invisible pixels have no meaningful colour.
+                        // Weighted by alpha: invisible pixels have no meaningful color.
                         for (sum, &value) in sum.iter_mut().zip(pixel) {
                             *sum += alpha * u64::from(value);
                         }
@@ -74,7 +72,7 @@ fn bytes(path: &Path) -> Result<Vec<u8>> {
 }
 
 fn bad(path: &Path, what: impl std::fmt::Display) -> Error {
-    Error::file(path, format!("is no PNG or JPEG that can be read ({what}); convert it to one"))
+    Error::file(path, format!("cannot be read as a PNG or JPEG ({what}); convert it to one"))
 }
 
 fn is_png(bytes: &[u8]) -> bool {
@@ -89,7 +87,6 @@ fn jpeg(bytes: &[u8]) -> JpegDecoder<Cursor<&[u8]>> {
     JpegDecoder::new_with_options(Cursor::new(bytes), options)
 }
 
-/// Reads a photo.
 pub fn read_photo(path: &Path) -> Result<Photo> {
     let bytes = bytes(path)?;
     if !is_png(&bytes) {
@@ -152,10 +149,10 @@ mod tests {
     fn every_kind_of_png_becomes_rgba() {
         use png::BitDepth::{Eight, Sixteen};
         use png::ColorType::{Grayscale, GrayscaleAlpha, Indexed, Rgb, Rgba};
-        let grey = [7, 7, 7, 255, 9, 9, 9, 255];
+        let gray = [7, 7, 7, 255, 9, 9, 9, 255];
         let kinds: [(_, _, &[u8], [u8; 8]); 6] = [
-            (Grayscale, Eight, &[7, 9], grey),
-            (Grayscale, Sixteen, &[7, 7, 9, 9], grey),
+            (Grayscale, Eight, &[7, 9], gray),
+            (Grayscale, Sixteen, &[7, 7, 9, 9], gray),
             (GrayscaleAlpha, Eight, &[7, 1, 9, 2], [7, 7, 7, 1, 9, 9, 9, 2]),
             (Rgb, Eight, &[1, 2, 3, 4, 5, 6], [1, 2, 3, 255, 4, 5, 6, 255]),
             (Rgba, Eight, &[1, 2, 3, 4, 5, 6, 7, 8], [1, 2, 3, 4, 5, 6, 7, 8]),
@@ -170,7 +167,7 @@ mod tests {
     }
 
     #[test]
-    fn a_photo_that_is_too_large_is_averaged_and_another_left_as_it_is() {
+    fn only_photos_that_are_too_large_are_averaged() {
         let pixel = |x: u8, y: u8| [10 * x, 100 + 10 * y, 50, 255];
         let rgba: Vec<u8> = (0..2).flat_map(|y| (0..6).flat_map(move |x| pixel(x, y))).collect();
         let photo = Photo { size: [6, 2], rgba: rgba.clone() };
@@ -178,14 +175,14 @@ mod tests {
         let small = photo.within(3);
         assert_eq!(small.size, [3, 1]);
         assert_eq!(small.rgba, [5, 105, 50, 255, 25, 105, 50, 255, 45, 105, 50, 255]);
-        // Thinner than what stays of it, and seen through.
+        // Thinner than the reduced size, and partly transparent.
         let line = Photo { size: [4, 1], rgba: [[9, 9, 9, 255], [77, 0, 0, 0]].concat().repeat(2) };
         let line = line.within(2);
         assert_eq!((line.size, line.rgba), ([2, 1], [9, 9, 9, 128].repeat(2)));
     }
 
     #[test]
-    fn a_jpeg_is_read_and_what_is_none_is_refused_by_name() {
+    fn a_jpeg_is_read_and_other_files_are_refused_by_name() {
         // 16x8: the left half (200, 40, 30), the right one (20, 60, 180).
         let bytes = include_bytes!("../tests/photo.jpg");
         let path = file("a.jpg", bytes);
@@ -202,7 +199,7 @@ mod tests {
         {
             let path = file(name, bytes);
             let error = read_photo(&path).expect_err(name).to_string();
-            assert!(error.contains(name) && error.contains("no PNG or JPEG"), "{error}");
+            assert!(error.contains(name) && error.contains("a PNG or JPEG"), "{error}");
             std::fs::remove_file(path).expect("clean");
         }
     }

@@ -28,8 +28,7 @@ pub fn to_bytes(image: &Image<f32>) -> Vec<u8> {
     image.color.iter().flatten().map(byte).collect()
 }
 
-/// Writes a rendered picture: R, G, B over the background as in the PNG (not linear light), A, and the
-/// expected depth Z in world units, 0 where nothing is.
+/// Writes R, G, B (not linear light), A, and the expected depth Z, 0 for empty pixels.
 pub fn write_exr(path: &Path, image: &Image<f32>) -> Result<()> {
     let expected = |(&depth, &alpha): (&f32, &f32)| if alpha > 0.0 { depth / alpha } else { 0.0 };
     let depth: Vec<f32> = image.depth.iter().zip(&image.alpha).map(expected).collect();

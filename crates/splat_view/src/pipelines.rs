@@ -88,7 +88,6 @@ impl Pipeline {
     }
 }
 
-/// A binding of a uniform buffer.
 pub fn uniform_layout(binding: u32, visibility: wgpu::ShaderStages) -> wgpu::BindGroupLayoutEntry {
     buffer_layout(binding, visibility, wgpu::BufferBindingType::Uniform)
 }
@@ -111,7 +110,6 @@ fn buffer_layout(
     }
 }
 
-/// A uniform buffer for one `T`.
 pub fn uniform<T>(gpu: &Gpu) -> wgpu::Buffer {
     gpu.device().create_buffer(&wgpu::BufferDescriptor {
         label: None,

@@ -27,12 +27,10 @@ pub struct PictureBuffers {
     bindings: wgpu::BindGroup,
 }
 
-/// The pipeline from the picture to the canvas.
 #[derive(Debug)]
 pub struct Rasterizing(Pipeline);
 
 impl Rasterizing {
-    /// Compiles it.
     pub fn new(gpu: &Gpu) -> Self {
         let stage = wgpu::ShaderStages::FRAGMENT;
         Self(Pipeline::new(
@@ -55,8 +53,7 @@ impl Rasterizing {
         Ok(PictureBuffers { size, picture, place, bindings })
     }
 
-    /// Draws a model's picture onto columns `begin..end` of a canvas, at least one. The work is
-    /// submitted, so that the buffers are free for the next model.
+    /// Draws a model onto columns `begin..end` of a canvas and submits the work.
     pub fn draw(
         &self,
         gpu: &Gpu,

@@ -1,4 +1,4 @@
-//! What the window saves: screenshots, EXR files, and the pictures of a camera path.
+//! Files saved from the window: screenshots, EXR files, and the pictures of a camera path.
 
 use std::path::{Path, PathBuf};
 
@@ -16,7 +16,7 @@ pub fn screenshot(viewer: &mut Viewer, painter: &mut Painter, size: [u32; 2]) ->
     let rgba = painter.picture(&viewer.shot(size))?;
     let path = free_name("splat-view", ".png");
     let written = write_png(&path, size, &without_alpha(&rgba));
-    viewer.notes.tell(saved(&path, written));
+    viewer.notes.show(saved(&path, written));
     Ok(())
 }
 
@@ -36,13 +36,13 @@ pub fn exr(viewer: &mut Viewer, gpu: &Gpu, size: [u32; 2]) {
         .and_then(|projected| gpu.rasterize(&projected, settings.background));
     let path = free_name("splat-view", ".exr");
     let written = image.and_then(|image| write_exr(&path, &image));
-    viewer.notes.tell(saved(&path, written));
+    viewer.notes.show(saved(&path, written));
 }
 
 /// Begins to record the camera path through the marked places.
 pub fn start_recording(viewer: &mut Viewer) {
     if viewer.path.keys.len() < 2 {
-        viewer.notes.tell("Mark at least two places with K, then record.");
+        viewer.notes.show("Mark at least two places with K, then record.");
         return;
     }
     let folder = free_name("splat-view-path", "");
@@ -52,7 +52,7 @@ pub fn start_recording(viewer: &mut Viewer) {
             viewer.recording = Some(recording);
         }
         Err(error) => {
-            viewer.notes.tell(format!("{}: cannot be made ({error})", folder.display()));
+            viewer.notes.show(format!("{}: cannot be created ({error})", folder.display()));
         }
     }
 }
@@ -72,7 +72,7 @@ pub fn record_picture(viewer: &mut Viewer, painter: &mut Painter, size: [u32; 2]
         viewer.recording = Some(recording);
     } else {
         let folder = recording.folder.display();
-        viewer.notes.tell(format!("Saved {total} pictures in {folder}"));
+        viewer.notes.show(format!("Saved {total} pictures in {folder}"));
     }
     Ok(())
 }

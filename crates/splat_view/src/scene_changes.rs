@@ -14,7 +14,7 @@ use crate::streaming::Streaming;
 use crate::viewer::Shown;
 
 impl Session {
-    /// Shows what was read before the window opened, from where the command line says.
+    /// Shows the scene that was read before the window opened, from the command line's view.
     pub fn begin(&mut self, start: Start) -> Result<()> {
         self.viewer.sources = start.sources;
         self.viewer.folder = start.folder;
@@ -23,7 +23,7 @@ impl Session {
         self.viewer.settings.background = background(&self.arguments, scene.as_deref());
         let first = first_camera(&self.arguments, &cameras)?;
         self.viewer.cameras = cameras;
-        self.viewer.notes.tell(note.unwrap_or_default());
+        self.viewer.notes.show(note.unwrap_or_default());
         for (side, (source, model)) in start.models.into_iter().enumerate() {
             self.viewer.chosen[side] = Some(source.path.clone());
             let stamp = stamp(&source.path);
@@ -39,7 +39,7 @@ impl Session {
         Ok(())
     }
 
-    /// Shows a model that was read on its side. One that cannot be read leaves what was there.
+    /// Shows a loaded model on its side. If it could not be read, the old model stays.
     fn show(&mut self, loaded: Loaded) {
         let Loaded { side, path, stamp, model } = loaded;
         let viewer = &mut self.viewer;
@@ -47,12 +47,12 @@ impl Session {
         let (drawable, mut model) = match drawable {
             Ok(both) => both,
             Err(error) => {
-                viewer.notes.tell(error.to_string());
+                viewer.notes.show(error.to_string());
                 return;
             }
         };
         for note in &model.notes {
-            viewer.notes.tell(note);
+            viewer.notes.show(note);
         }
         if let Some((_, cameras)) = self.dropped.take_if(|(dropped, _)| *dropped == path) {
             // A dropped scene replaces the cameras, too, unless it is compared and has none.
@@ -86,7 +86,7 @@ impl Session {
         self.screen.window.request_redraw();
     }
 
-    /// Tells scenes in levels of detail where the camera is.
+    /// Sends the camera to scenes in levels of detail.
     pub fn follow(&mut self) {
         let size = self.screen.size();
         let seen = view(&self.viewer.camera(size), self.viewer.settings.near);
@@ -97,7 +97,7 @@ impl Session {
         }
     }
 
-    /// Draws what scenes in levels of detail have read since.
+    /// Draws newly loaded parts of scenes in levels of detail.
     fn receive_details(&mut self) {
         let viewer = &mut self.viewer;
         for shown in viewer.shown.iter_mut().flatten() {
@@ -108,14 +108,13 @@ impl Session {
                         shown.drawable = drawable;
                         shown.model.file = file;
                     }
-                    Err(error) => viewer.notes.tell(error.to_string()),
+                    Err(error) => viewer.notes.show(error.to_string()),
                 }
                 self.screen.window.request_redraw();
             }
         }
     }
 
-    /// Shows what the loader has read.
     pub fn receive(&mut self) {
         self.receive_details();
         while let Some(loaded) = self.loader.next() {
@@ -133,7 +132,6 @@ impl Session {
         });
     }
 
-    /// Shows another model on a side, or none.
     pub fn choose(&mut self, side: usize, path: Option<PathBuf>) {
         self.viewer.chosen[side].clone_from(&path);
         match path {
@@ -149,7 +147,7 @@ impl Session {
     /// Looks for models that are new or have changed.
     pub fn poll_files(&mut self) {
         if let Some(folder) = &self.viewer.folder {
-            // While a folder is empty, what was found before stays.
+            // While a folder is empty, keep the old list.
             if let Ok(found) = find_sources(folder) {
                 let other = |s: &Source| !s.path.starts_with(folder);
                 let kept = self.viewer.sources.iter().filter(|s| other(s)).cloned();
@@ -186,7 +184,7 @@ impl Session {
                 self.dropped = Some((first.clone(), cameras));
                 self.choose(0, Some(first));
             }
-            Err(error) => self.viewer.notes.tell(error.to_string()),
+            Err(error) => self.viewer.notes.show(error.to_string()),
         }
         self.screen.window.request_redraw();
     }

@@ -1,4 +1,4 @@
-//! The view of a scene that the command line asks for, and what holds where it says nothing.
+//! The command line's view of a scene, with its defaults.
 
 use std::path::Path;
 
@@ -16,8 +16,7 @@ use crate::viewpoint::{Viewpoint, up_of};
 /// Near plane of small scenes, as a fraction of their radius.
 const NEAR_PART: f64 = 0.05;
 
-/// A capture's cameras: those that were named, else those of the fit that a scene is of. Cameras that nobody
-/// named and that cannot be read are left out, and the note says so.
+/// The named cameras, else the scene's fit's; a note reports unreadable ones.
 pub fn cameras_of(
     named: Option<&Path>,
     scene: Option<&Path>,
@@ -34,13 +33,12 @@ pub fn cameras_of(
     }
 }
 
-/// Behind the splats: what the command line says, else what the scene was fitted over, else black.
+/// Background color: the command line's, else the fit's, else black.
 pub fn background(arguments: &Arguments, scene: Option<&Path>) -> [f32; 3] {
     let said = arguments.background;
     said.or_else(|| scene.and_then(background_beside)).unwrap_or_default()
 }
 
-/// The camera that `--camera` names.
 pub fn numbered(cameras: &[CaptureCamera], number: usize) -> Result<&CaptureCamera> {
     cameras.get(number).ok_or_else(|| {
         Error::argument(
@@ -60,8 +58,7 @@ pub fn up(arguments: &Arguments, cameras: &[CaptureCamera], model: &Model) -> DV
         .unwrap_or_else(|| up_of_splats(&model.file, model.center, model.radius))
 }
 
-/// The camera that the first picture is taken by: the one that is named, else the capture's first
-/// unless another field of view is asked for.
+/// The first picture's camera: the named one, else the capture's first unless --fov is given.
 pub fn first_camera(arguments: &Arguments, cameras: &[CaptureCamera]) -> Result<Option<usize>> {
     if let Some(number) = arguments.camera {
         return numbered(cameras, number).map(|_| Some(number));
@@ -70,8 +67,7 @@ pub fn first_camera(arguments: &Arguments, cameras: &[CaptureCamera]) -> Result<
     Ok(is_photo.then_some(0))
 }
 
-/// Near plane of a scene: the renderer's, or less for scenes so small that it would cut them off. A whole
-/// scene is seen from about three times its radius.
+/// Near plane of a scene, smaller for small scenes: a scene is seen from three times its radius.
 pub fn near(model: &Model) -> f32 {
     let own = (NEAR_PART * model.radius) as f32;
     own.clamp(f32::MIN_POSITIVE, NEAR)

@@ -15,23 +15,20 @@ use winit::window::Window;
 
 use crate::painter::{check_size, side_max};
 
-/// The window's size where nobody names one, in logical pixels.
+/// Default window size, in logical pixels.
 const SIZE: LogicalSize<f64> = LogicalSize::new(1280.0, 720.0);
 
-/// What winit says, without the file and line of its source that it begins with.
+/// winit's error message, without the file and line at its start.
 pub fn reason(error: &impl std::fmt::Display) -> String {
     let text = error.to_string();
     let rest = text.strip_prefix("os error at ").and_then(|text| text.split_once(": "));
     rest.map_or(text.as_str(), |(_, reason)| reason).to_owned()
 }
 
-/// A window with what draws in it.
 pub struct Screen {
-    /// The window.
     pub window: Arc<Window>,
     /// The device that the surface belongs to.
     pub gpu: Arc<Gpu>,
-    /// Panel and gestures.
     pub egui: egui::Context,
     surface: wgpu::Surface<'static>,
     config: wgpu::SurfaceConfiguration,
@@ -39,7 +36,7 @@ pub struct Screen {
     renderer: egui_wgpu::Renderer,
 }
 
-/// What egui has to paint in one frame; its textures are on the device already.
+/// egui's output for one frame; its textures are on the device already.
 pub struct Interface {
     shapes: Vec<ClippedShape>,
     scale: f32,
@@ -67,8 +64,8 @@ impl Screen {
         let size = window.inner_size();
         let mut config = surface
             .get_default_config(&adapter, size.width.clamp(1, most), size.height.clamp(1, most))
-            .ok_or_else(|| failed(format!("{} shows nothing in it", gpu.name())))?;
-        // Colours are encoded as they are shown, and egui blends them so.
+            .ok_or_else(|| failed(format!("{} cannot draw in it", gpu.name())))?;
+        // Colors are encoded as they are shown, and egui blends them so.
         let formats = surface.get_capabilities(&adapter).formats;
         config.format = formats.iter().copied().find(|f| !f.is_srgb()).unwrap_or(config.format);
         config.present_mode = wgpu::PresentMode::AutoVsync;
@@ -87,12 +84,10 @@ impl Screen {
         Ok(Self { window, gpu: Arc::new(gpu), egui, surface, config, input, renderer })
     }
 
-    /// Format of the surface's textures.
     pub fn format(&self) -> wgpu::TextureFormat {
         self.config.format
     }
 
-    /// Width and height in pixels.
     pub fn size(&self) -> [u32; 2] {
         [self.config.width, self.config.height]
     }
@@ -113,11 +108,11 @@ impl Screen {
     pub fn configure(&self) -> Result<()> {
         self.surface.configure(self.gpu.device(), &self.config);
         self.gpu.check().map_err(|e| {
-            Error::Device(format!("the window can no longer be drawn in ({e}); open it again"))
+            Error::Device(format!("the window can no longer be drawn ({e}); open it again"))
         })
     }
 
-    /// Tells egui of an event, and asks for a frame if egui wants one.
+    /// Passes an event to egui, and requests a frame if egui wants one.
     pub fn pass_to_egui(&mut self, event: &WindowEvent) {
         let response = self.input.on_window_event(&self.window, event);
         // A frame that asked for the next one would redraw a window without end in which nothing moves.
@@ -126,7 +121,6 @@ impl Screen {
         }
     }
 
-    /// Runs one frame of the interface.
     pub fn run_ui(&mut self, ui: impl FnMut(&mut Ui)) -> Interface {
         let input = self.input.take_egui_input(&self.window);
         let mut output = self.egui.run_ui(input, ui);
@@ -146,11 +140,10 @@ impl Screen {
         }
     }
 
-    /// The texture to draw in, None if there is none this time; and whether the surface must be
-    /// configured again.
+    /// The texture to draw in, if any, and whether the surface must be configured again.
     pub fn acquire(&self) -> Result<(Option<wgpu::SurfaceTexture>, bool)> {
         let current = match self.window.inner_size() {
-            // Minimised: there is nothing to draw on.
+            // Minimized: there is nothing to draw on.
             size if size.width == 0 || size.height == 0 => Current::Occluded,
             _ => self.surface.get_current_texture(),
         };
@@ -170,8 +163,7 @@ impl Screen {
         })
     }
 
-    /// Records the interface onto a target, over what is there or, with `LoadOp::Clear`, alone. The
-    /// command buffers that are returned must be submitted before the encoder's.
+    /// Records the interface onto a target. Submit the returned buffers before the encoder's.
     pub fn record(
         &mut self,
         encoder: &mut wgpu::CommandEncoder,
@@ -202,7 +194,6 @@ impl Screen {
         uploads
     }
 
-    /// Submits a frame and shows it.
     pub fn show(
         &self,
         texture: wgpu::SurfaceTexture,
@@ -213,7 +204,7 @@ impl Screen {
         self.gpu.queue().present(texture);
     }
 
-    /// Frees what only this frame's interface used.
+    /// Frees this frame's textures.
     pub fn finish(&mut self, interface: &Interface) {
         for id in &interface.unused {
             self.renderer.free_texture(id);

@@ -1,4 +1,4 @@
-//! What happens in an open window: one frame after the other, and what the user asks for.
+//! The event loop of an open window: frames and user actions.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -21,7 +21,6 @@ use crate::{gestures, overlay, panel, saving};
 
 /// How often files are checked for changes.
 const POLL: Duration = Duration::from_millis(500);
-/// Width of the panel in points.
 const PANEL_WIDTH: f32 = 250.0;
 
 /// Another thread has something ready.
@@ -30,17 +29,11 @@ pub struct Wake;
 
 /// An open window and all that lives with it. `scene_changes` has the part that loads models.
 pub struct Session {
-    /// The window.
     pub screen: Screen,
-    /// Draws splats.
     pub painter: Painter,
-    /// What is shown, and how.
     pub viewer: Viewer,
-    /// Reads models beside the window.
     pub loader: Loader,
-    /// Wakes the event loop.
     pub proxy: EventLoopProxy<Wake>,
-    /// The command line.
     pub arguments: Arguments,
     /// The photo of a camera, by the camera's number.
     pub photo: Option<(usize, TextureHandle)>,
@@ -53,7 +46,6 @@ pub struct Session {
 }
 
 impl Session {
-    /// A window that shows nothing yet.
     pub fn new(screen: Screen, arguments: Arguments, proxy: EventLoopProxy<Wake>) -> Result<Self> {
         let painter = Painter::new(Arc::clone(&screen.gpu), screen.format())?;
         let mut settings = Settings::default();
@@ -88,7 +80,7 @@ impl Session {
         self.due.map_or(next, |due| due.min(next))
     }
 
-    /// Runs the panel and the gestures, does what they ask for, and draws.
+    /// Runs the panel and the gestures, handles their actions, and draws.
     pub fn frame(&mut self) -> Result<()> {
         let started = Instant::now();
         let times = self.painter.times.latest();
@@ -161,7 +153,7 @@ impl Session {
             Action::Jump(number) => viewer.jump(number),
             Action::Focus(pixel) => {
                 if !viewer.focus(&mut self.painter, size, pixel)? {
-                    viewer.notes.tell("There is nothing at this point.");
+                    viewer.notes.show("There is nothing at this point.");
                 }
             }
             Action::Screenshot => saving::screenshot(viewer, &mut self.painter, size)?,
@@ -180,7 +172,7 @@ impl Session {
                 let text = error.to_string();
                 // An error of every frame is shown once.
                 if !self.viewer.notes.has(&text) {
-                    self.viewer.notes.tell(text);
+                    self.viewer.notes.show(text);
                     self.screen.window.request_redraw();
                 }
                 Ok(())
@@ -220,8 +212,7 @@ impl Session {
         self.say(gpu.check())
     }
 
-    /// Records the models' picture; which stages it has, and what to do with the target before the panel
-    /// is painted.
+    /// Records the models' picture; returns its stages, and the load operation for the panel's pass.
     fn record_scene(
         &mut self,
         encoder: &mut wgpu::CommandEncoder,
@@ -231,7 +222,7 @@ impl Session {
         let recorded = match self.painter.record(encoder, &self.viewer.shot(size), target) {
             // The way that was asked for lacks memory here: another is taken, and the panel says why.
             Err(error) if self.viewer.settings.drawing == Drawing::Rasterizer => {
-                self.viewer.notes.tell(error.to_string());
+                self.viewer.notes.show(error.to_string());
                 self.viewer.settings.drawing = Drawing::Auto;
                 self.screen.window.request_redraw();
                 self.painter.record(encoder, &self.viewer.shot(size), target)
@@ -270,7 +261,7 @@ impl Session {
                 self.photo = Some((number, texture));
             }
             Err(error) => {
-                viewer.notes.tell(error.to_string());
+                viewer.notes.show(error.to_string());
                 viewer.photo_strength = 0.0;
             }
         }

@@ -6,12 +6,9 @@ use std::time::SystemTime;
 use splat_render::levels::INDEX;
 use splat_render::{Error, Result};
 
-/// A model that can be shown.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Source {
-    /// Label in the panel.
     pub name: String,
-    /// The file.
     pub path: PathBuf,
     /// The folder that was named, or the one that the file lies in.
     pub folder: PathBuf,
@@ -41,7 +38,6 @@ fn folder_name(folder: &Path) -> String {
         .unwrap_or_else(|| folder.display().to_string())
 }
 
-/// When a file was written, and its length.
 pub type Stamp = (SystemTime, u64);
 
 /// When a file was last written, and its length.
@@ -50,8 +46,7 @@ pub fn stamp(path: &Path) -> Option<Stamp> {
     Some((metadata.modified().ok()?, metadata.len()))
 }
 
-/// The models at a path: the file itself, or those that a fit or a refinement has left in a folder,
-/// the one to show first in front.
+/// The models at a path: the file, or a folder's models of a fit or refinement, default first.
 pub fn find_sources(path: &Path) -> Result<Vec<Source>> {
     if !path.is_dir() {
         let name = path.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned());
@@ -154,7 +149,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_being_fitted_comes_first() {
+    fn the_newest_scene_comes_first() {
         let folder = folder("fit", &["scene.ply", "checkpoint.npz"]);
         assert_eq!(names_of(&folder), ["scene", "checkpoint"]);
         set_age(&folder.join("scene.ply"), 100);

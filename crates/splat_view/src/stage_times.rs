@@ -5,8 +5,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use splat_render::gpu::Gpu;
 
-/// The stages of a frame: the first six for each of two models. A model is drawn by blending, or
-/// by bin, rasterize and canvas.
+/// The stages of a frame; the first six twice, once per model.
 pub const STAGES: [&str; 14] = [
     "project",
     "sort",
@@ -23,23 +22,15 @@ pub const STAGES: [&str; 14] = [
     "compose",
     "panel",
 ];
-/// Splats are projected to 2D splats.
 pub const PROJECT: usize = 0;
-/// 2D splats are sorted by depth.
 pub const SORT: usize = 1;
-/// The blending unit draws 2D splats onto a canvas.
 pub const BLEND: usize = 2;
-/// Each tile gets its list of splats.
 pub const BIN: usize = 3;
-/// The rasterizer draws its picture.
 pub const RASTERIZE: usize = 4;
-/// That picture is copied onto a canvas.
 pub const CANVAS: usize = 5;
 /// First stage of the second model.
 pub const SECOND: usize = 6;
-/// The canvases are composed into one picture.
 pub const COMPOSE: usize = 12;
-/// egui paints panel and overlays.
 pub const PANEL: usize = 13;
 
 /// Which stages of a frame wrote a timestamp.
@@ -66,7 +57,6 @@ struct Queries {
     set: wgpu::QuerySet,
     resolved: wgpu::Buffer,
     readable: wgpu::Buffer,
-    /// Milliseconds of one tick.
     tick: f64,
     /// Stages of the frame whose times are being read back.
     written: Written,
@@ -74,7 +64,7 @@ struct Queries {
     is_mapped: Arc<AtomicBool>,
 }
 
-/// Where passes write their timestamps; `first` stands before the numbers of stages.
+/// Timestamp writes of passes; `first` is added to the numbers of stages.
 #[derive(Debug, Clone, Copy)]
 pub struct Stamps<'a> {
     set: Option<&'a wgpu::QuerySet>,
@@ -82,12 +72,10 @@ pub struct Stamps<'a> {
 }
 
 impl<'a> Stamps<'a> {
-    /// No timestamps.
     pub fn none() -> Self {
         Self { set: None, first: 0 }
     }
 
-    /// Whether passes write any.
     pub fn are_written(&self) -> bool {
         self.set.is_some()
     }
@@ -96,7 +84,6 @@ impl<'a> Stamps<'a> {
         Some((self.first + stage) as u32)
     }
 
-    /// For a compute pass.
     pub fn compute(&self, stage: usize) -> Option<wgpu::ComputePassTimestampWrites<'a>> {
         self.set.map(|query_set| wgpu::ComputePassTimestampWrites {
             query_set,
@@ -105,7 +92,6 @@ impl<'a> Stamps<'a> {
         })
     }
 
-    /// For a render pass.
     pub fn render(&self, stage: usize) -> Option<wgpu::RenderPassTimestampWrites<'a>> {
         self.set.map(|query_set| wgpu::RenderPassTimestampWrites {
             query_set,
@@ -116,7 +102,6 @@ impl<'a> Stamps<'a> {
 }
 
 impl StageTimes {
-    /// Times of frames on this device.
     pub fn new(gpu: &Gpu) -> Self {
         let device = gpu.device();
         let queries =
@@ -141,8 +126,7 @@ impl StageTimes {
         Self { queries, last: None }
     }
 
-    /// Where the passes of a frame write, beginning with stage `first`; nowhere while an earlier
-    /// frame's times are being read back.
+    /// Timestamp writes from stage `first` on; none while a read-back is pending.
     pub fn stamps(&self, first: usize) -> Stamps<'_> {
         let set = self.queries.as_ref().filter(|q| !q.is_pending).map(|q| &q.set);
         Stamps { set, first }
@@ -163,7 +147,7 @@ impl StageTimes {
     pub fn resolve(&mut self, encoder: &mut wgpu::CommandEncoder, written: Written) {
         let Some(q) = self.queries.as_mut().filter(|q| !q.is_pending) else { return };
         q.written = written;
-        // Only what was written may be resolved.
+        // Only written queries may be resolved.
         for query in (0..COUNT).filter(|&query| query == BEGIN || written[query]) {
             let at = query as u64 * ALIGNMENT;
             encoder.resolve_query_set(&q.set, query as u32..query as u32 + 1, &q.resolved, at);
@@ -186,8 +170,7 @@ impl StageTimes {
         self.queries.as_ref().is_some_and(|q| q.is_pending)
     }
 
-    /// Milliseconds of each stage of the latest frame whose times have arrived, 0 for stages that it did
-    /// not have; None before the first.
+    /// Milliseconds of the latest timed frame's stages, 0 for absent ones; None before the first.
     pub fn latest(&mut self) -> Option<[f32; STAGES.len()]> {
         if let Some(q) = &mut self.queries
             && q.is_mapped.swap(false, Ordering::Acquire)

@@ -1,4 +1,4 @@
-//! What the command line names, read before a window opens: errors are printed where it was typed.
+//! Reads the command line's files before a window opens, so that errors are printed.
 
 use std::path::PathBuf;
 
@@ -9,18 +9,15 @@ use crate::detail::is_in_levels;
 use crate::model::Model;
 use crate::sources::{Source, find_sources};
 
-/// What is shown first.
 pub struct Start {
     /// The models that can be chosen.
     pub sources: Vec<Source>,
     /// The first folder that was named; it is watched.
     pub folder: Option<PathBuf>,
-    /// The models on the left and on the right side.
     pub models: Vec<(Source, Model)>,
 }
 
 impl Start {
-    /// Reads the scenes of a command line.
     pub fn read(arguments: &Arguments) -> Result<Self> {
         let mut out = Self { sources: Vec::new(), folder: None, models: Vec::new() };
         for scene in &arguments.scenes {

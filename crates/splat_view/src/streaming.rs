@@ -1,5 +1,4 @@
-//! Follows the view of a scene in levels of detail: a thread reads what the camera needs, while the window
-//! goes on drawing what is there.
+//! Follows the view of a scene in levels of detail: a thread reads splats while the window draws.
 
 use std::sync::mpsc::{Receiver, Sender, SyncSender, channel, sync_channel};
 use std::time::{Duration, Instant};
@@ -9,7 +8,7 @@ use splat_render::levels::{Choice, Drawn, View};
 
 use crate::detail::Detail;
 
-/// How often what has been read is shown, while more is being read.
+/// Interval at which loaded splats are shown during reading.
 const SHOWN_EVERY: Duration = Duration::from_millis(300);
 
 /// A thread that follows a view; it ends when this goes.
@@ -30,7 +29,6 @@ impl Streaming {
         Self { views, drawn, last: None }
     }
 
-    /// Says where the camera is.
     pub fn look(&mut self, view: View) {
         if self.last != Some(view) {
             self.last = Some(view);
@@ -51,7 +49,7 @@ struct Answers<F> {
 }
 
 impl<F: Fn()> Answers<F> {
-    /// False once nobody listens.
+    /// False once the receiver is gone.
     fn tell(&self, answer: Result<Drawn>) -> bool {
         let is_heard = self.answers.send(answer).is_ok();
         (self.wake)();
@@ -154,7 +152,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_camera_is_at_is_fine_and_the_budget_holds() {
+    fn near_cells_are_fine_within_the_budget() {
         let folder = levels("follow");
         let (detail, coarse) =
             Detail::open(&folder.join("levels/lod-meta.json"), 600).expect("open");
@@ -174,7 +172,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_that_goes_is_told_once_and_the_rest_is_drawn() {
+    fn a_deleted_file_is_reported_once_and_the_rest_is_drawn() {
         let folder = levels("gone");
         let (detail, _) = Detail::open(&folder.join("levels/lod-meta.json"), 600).expect("open");
         for entry in std::fs::read_dir(folder.join("levels")).expect("folder").flatten() {

@@ -1,4 +1,4 @@
-//! What lies beside a scene in the folder of an igsr fit or refinement: cameras, and the background.
+//! Files next to a scene in the folder of an igsr fit or refinement: cameras, and the background.
 
 use std::io::Read;
 use std::path::{Path, PathBuf};
@@ -9,13 +9,13 @@ use splat_render::io::open_file;
 
 use crate::capture::find_cameras;
 
-/// What a run leaves while it goes on: cameras with their photos, and the background.
+/// Folder that a running fit or refinement writes: cameras with their photos, and the background.
 const VIEW: &str = "view";
 /// Largest report that is read, bytes.
 const REPORT_MAX: u64 = 64 << 20;
 
-/// Folders that may belong to a scene, the nearest first: its own, and that of the run which it is a
-/// round or a checkpoint of (`DIR` for `DIR/rounds/3/scene.ply` and `DIR/checkpoints/whole.npz`).
+/// Folders that may belong to a scene, the nearest first: its parent, and the folder of the run whose
+/// round or checkpoint it is (`DIR` for `DIR/rounds/3/scene.ply` and `DIR/checkpoints/whole.npz`).
 fn folders_of(scene: &Path) -> Vec<PathBuf> {
     let own = if scene.is_dir() {
         scene.to_owned()
@@ -23,7 +23,7 @@ fn folders_of(scene: &Path) -> Vec<PathBuf> {
         let parent = scene.parent().filter(|parent| !parent.as_os_str().is_empty());
         parent.unwrap_or(Path::new(".")).to_owned()
     };
-    // Names, also where the scene is `scene.ply` or `./scene.ply`.
+    // Resolve names for relative paths such as `scene.ply` and `./scene.ply`.
     let whole = own.canonicalize().unwrap_or_else(|_| own.clone());
     let named = |path: &Path, name: &str| path.file_name().is_some_and(|own| own == name);
     let above = whole.parent().unwrap_or(&whole);
@@ -38,8 +38,7 @@ fn folders_of(scene: &Path) -> Vec<PathBuf> {
     [Some(own), run].into_iter().flatten().collect()
 }
 
-/// The file of cameras that belongs to a scene. Before a run has written its own, that is the one it
-/// leaves for those who look on.
+/// The file of cameras that belongs to a scene: a finished run's, or the one of a run in progress.
 pub fn cameras_beside(scene: &Path) -> Option<PathBuf> {
     let folders = folders_of(scene);
     let own = folders.iter().find_map(|folder| find_cameras(folder));
@@ -56,7 +55,6 @@ struct Background {
     background: [f32; 3],
 }
 
-/// A fit's report.
 #[derive(Deserialize)]
 struct FitReport {
     protocol: Background,
@@ -79,7 +77,7 @@ fn background_in(folder: &Path) -> Option<[f32; 3]> {
     color.iter().all(|channel| (0.0..=1.0).contains(channel)).then_some(color)
 }
 
-/// The part of a JSON file that a type has; None where there is no such file or part.
+/// Reads a type from a JSON file; None if there is no such file, or it does not match.
 fn read<T: DeserializeOwned>(path: &Path) -> Option<T> {
     let mut bytes = Vec::new();
     open_file(path).ok()?.take(REPORT_MAX).read_to_end(&mut bytes).ok()?;
@@ -125,7 +123,7 @@ mod tests {
     }
 
     #[test]
-    fn a_running_fit_s_cameras_are_taken_until_it_writes_its_own() {
+    fn a_running_fit_uses_the_given_cameras_until_it_writes_its_own() {
         let folder = run_folder("running", &[("checkpoint.npz", ""), ("view/cameras.json", "")]);
         let checkpoint = folder.join("checkpoint.npz");
         assert_eq!(cameras_beside(&checkpoint), Some(folder.join("view/cameras.json")));
@@ -135,7 +133,7 @@ mod tests {
     }
 
     #[test]
-    fn the_background_is_that_of_the_fit_or_the_refinement() {
+    fn the_background_is_the_fit_s_or_the_refinement_s() {
         let cases = [
             ("report.json", r#"{"protocol": {"background": [1, 1, 0.5], "x": 1}}"#, true),
             (

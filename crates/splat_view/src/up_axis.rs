@@ -7,27 +7,25 @@
 use glam::{DMat3, DQuat, DVec3};
 use splat_render::io::SplatFile;
 
-/// Up axis where nothing tells: in COLMAP's scenes, and so in most captures, y points down.
+/// Default up axis: in COLMAP's scenes, and so in most captures, y points down.
 pub const USUAL: DVec3 = DVec3::NEG_Y;
-/// Up axes of captures by their conventions: COLMAP's, and that of transforms.json.
+/// Up axes of conventions: COLMAP's, and transforms.json's.
 const CONVENTIONS: [DVec3; 2] = [DVec3::NEG_Y, DVec3::Z];
 /// Splats of a lower opacity logit do not count.
 const FAINT_LOGIT: f32 = 0.0;
-/// Number of splats that are looked at.
 const SAMPLES: usize = 20_000;
 /// A flat splat's shortest axis is at most so long, of the middle one.
 const FLAT: f64 = 0.4;
 /// Cosine of the angle, 12 degrees, within which directions are alike.
-const ALIKE: f64 = 0.978;
-/// Directions that are tried.
+const PARALLEL: f64 = 0.978;
 const DIRECTIONS: usize = 1500;
-/// What a direction of a convention gains over others, at most.
+/// Maximum bonus of a convention's direction.
 const BONUS: f64 = 1.0;
-/// A plane has at least so many times the weight that directions have on average, and so many splats.
-const CLEAR: f64 = 4.0;
-const FEWEST: usize = 20;
+/// Minimum weight of a plane relative to the mean over directions.
+const MIN_WEIGHT: f64 = 4.0;
+/// Minimum number of splats in a plane.
+const MIN_SPLATS: usize = 20;
 
-/// A splat that is seen.
 struct Flake {
     at: DVec3,
     /// Its shortest axis, or zero if it is not flat.
@@ -35,7 +33,7 @@ struct Flake {
     weight: f64,
 }
 
-/// The estimated up axis, a unit vector; [`USUAL`] where the splats have no common plane.
+/// The estimated up axis, a unit vector; [`USUAL`] if the splats have no common plane.
 pub fn up_of_splats(file: &SplatFile, center: DVec3, radius: f64) -> DVec3 {
     estimated(&flakes(file, center, radius)).unwrap_or(USUAL)
 }
@@ -71,7 +69,7 @@ fn estimated(flakes: &[Flake]) -> Option<DVec3> {
         return None;
     }
     let along = |direction: DVec3| {
-        flakes.iter().filter(move |flake| flake.normal.dot(direction).abs() > ALIKE)
+        flakes.iter().filter(move |flake| flake.normal.dot(direction).abs() > PARALLEL)
     };
     let score = |direction: DVec3| {
         let usual = CONVENTIONS.iter().map(|up| up.dot(direction).abs()).fold(0.0, f64::max);
@@ -84,18 +82,18 @@ fn estimated(flakes: &[Flake]) -> Option<DVec3> {
         .max_by(|(one, _), (other, _)| one.total_cmp(other))?
         .1;
     // Directions within the angle cover this part of the sphere's halves.
-    let by_chance = total * (1.0 - ALIKE);
+    let by_chance = total * (1.0 - PARALLEL);
     let weight: f64 = along(best).map(|flake| flake.weight).sum();
-    if weight < CLEAR * by_chance || along(best).count() < FEWEST {
+    if weight < MIN_WEIGHT * by_chance || along(best).count() < MIN_SPLATS {
         return None;
     }
     let mean: DVec3 =
         along(best).map(|f| f.normal * (f.weight * f.normal.dot(best).signum())).sum();
     let up = mean.try_normalize()?;
-    // The scene stands on the plane: what is not in it is above. Medians, since few photos leave
-    // large splats below that nothing in them tells the place of.
+    // The scene stands on the plane: up is the side with the rest of the splats. Medians, since few
+    // photos leave large splats below at arbitrary places.
     let height = |is_ground: bool| {
-        let there = |flake: &&Flake| (flake.normal.dot(best).abs() > ALIKE) == is_ground;
+        let there = |flake: &&Flake| (flake.normal.dot(best).abs() > PARALLEL) == is_ground;
         median(flakes.iter().filter(there).map(|flake| flake.at.dot(up)).collect())
     };
     Some(if height(false) < height(true) { -up } else { up })
@@ -150,7 +148,7 @@ mod tests {
     }
 
     #[test]
-    fn up_is_the_side_of_the_floor_that_things_stand_on() {
+    fn up_is_the_side_of_the_floor_with_objects() {
         for up in [DVec3::NEG_Y, DVec3::Z, DVec3::X, DVec3::new(0.3, -0.8, -0.5).normalize()] {
             let found = up_of_splats(&room(up), DVec3::ZERO, 1.0);
             assert!(found.dot(up) > 0.999, "{found} for {up}");

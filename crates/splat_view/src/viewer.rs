@@ -16,7 +16,6 @@ use crate::sources::{Source, Stamp, label};
 use crate::streaming::Streaming;
 use crate::viewpoint::{Viewpoint, fitted};
 
-/// How keys and drags move the camera.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Moving {
     /// Drags orbit about a point.
@@ -29,27 +28,23 @@ pub enum Moving {
 }
 
 impl Moving {
-    /// All modes, with their labels.
     pub const ALL: [(Self, &str); 3] =
         [(Self::Orbit, "Orbit"), (Self::Fly, "Fly"), (Self::FirstPerson, "First person")];
 }
 
-/// A model that is drawn.
 #[derive(Debug)]
 pub struct Shown {
-    /// Its file.
     pub path: PathBuf,
     /// The file's stamp when it was read.
     pub stamp: Option<Stamp>,
     /// The model in memory: for its extent, and for files with depth.
     pub model: Model,
-    /// On the device.
     pub drawable: Drawable,
-    /// Reads what the view needs of a scene in levels of detail.
+    /// Streams splats of a scene in levels of detail.
     pub streaming: Option<Streaming>,
 }
 
-/// What the panel, keys and gestures ask the session to do.
+/// Requests of the panel, keys and gestures to the session.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Action {
     /// Show a source on a side; None removes the right side.
@@ -58,44 +53,34 @@ pub enum Action {
     Frame,
     /// Move the view to a camera of the capture.
     Jump(usize),
-    /// Move the pivot of orbits to what is at a pixel.
+    /// Move the pivot of orbits to the surface at a pixel.
     Focus([u32; 2]),
-    /// Save the picture.
     Screenshot,
     /// Save the render with alpha and depth.
     SaveExr,
     /// Draw the path's pictures to files.
     Record,
-    /// Stop doing so.
     StopRecording,
 }
 
-/// The state of the window.
 #[derive(Debug)]
 pub struct Viewer {
-    /// Models that can be chosen.
     pub sources: Vec<Source>,
     /// A folder whose models come and change.
     pub folder: Option<PathBuf>,
     /// The files chosen for the left and the right side.
     pub chosen: [Option<PathBuf>; 2],
-    /// What is drawn there.
     pub shown: [Option<Shown>; 2],
-    /// Where the right side begins, as a fraction of the width.
+    /// Start of the right side, as a fraction of the width.
     pub divider: f32,
-    /// Whether the pointer holds the divider.
     pub holds_divider: bool,
-    /// How splats are drawn.
     pub settings: Settings,
-    /// The view.
     pub viewpoint: Viewpoint,
     /// Whether a model or a camera has set `viewpoint`.
     pub is_placed: bool,
     /// The up axis, a unit vector.
     pub up: DVec3,
-    /// How the view is moved.
     pub moving: Moving,
-    /// The capture's cameras.
     pub cameras: Vec<CaptureCamera>,
     /// The camera that the view is at.
     pub at_camera: Option<usize>,
@@ -103,24 +88,18 @@ pub struct Viewer {
     pub shows_cameras: bool,
     /// Opacity of the photo over the picture from its camera, 0 to 1.
     pub photo_strength: f32,
-    /// Places marked for a recording.
     pub path: CameraPath,
     /// Pictures from each place to the next.
     pub pictures_between: u32,
-    /// The recording under way.
     pub recording: Option<Recording>,
-    /// Results and errors.
     pub notes: Notes,
-    /// Whether the panel is shown.
     pub shows_panel: bool,
-    /// Name of the device.
     pub device: String,
     /// Milliseconds from the start of a frame until it is shown.
     pub frame_ms: f32,
 }
 
 impl Viewer {
-    /// A window that shows nothing.
     pub fn new(settings: Settings, device: String) -> Self {
         Self {
             sources: Vec::new(),
@@ -148,7 +127,7 @@ impl Viewer {
         }
     }
 
-    /// Centre and radius of what is shown.
+    /// Center and radius of the scene.
     pub fn extent(&self) -> (DVec3, f64) {
         let shown = self.shown.iter().flatten().next();
         shown.map_or((DVec3::ZERO, 1.0), |shown| (shown.model.center, shown.model.radius))
@@ -180,13 +159,12 @@ impl Viewer {
         }
     }
 
-    /// Fits the whole scene in the picture.
     pub fn frame(&mut self) {
         let (center, radius) = self.extent();
         self.viewpoint = Viewpoint::framing(center, radius, self.up, self.settings.fov);
     }
 
-    /// What a frame of a size shows.
+    /// The content of a frame of a size.
     pub fn shot(&self, size: [u32; 2]) -> Shot<'_> {
         let drawable = |side: usize| self.shown[side].as_ref().map(|shown| &shown.drawable);
         let camera = self.camera(size);
@@ -203,8 +181,7 @@ impl Viewer {
         }
     }
 
-    /// Makes what is under a pixel the pivot of orbits and the centre of the picture. False if there is
-    /// nothing.
+    /// Moves the pivot of orbits to the surface at a pixel; false if the pixel is empty.
     pub fn focus(
         &mut self,
         painter: &mut Painter,
@@ -228,13 +205,12 @@ impl Viewer {
         self.sources.iter().position(|source| source.path == chosen)
     }
 
-    /// What a file is called.
+    /// Display name of a file.
     pub fn name_of(&self, path: &Path) -> String {
         let found = self.sources.iter().find(|source| source.path == path);
         found.map_or_else(|| path.display().to_string(), |source| label(source, &self.sources))
     }
 
-    /// Whether there are two sides.
     pub fn compares(&self) -> bool {
         self.shown[1].is_some()
     }

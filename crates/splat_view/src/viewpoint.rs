@@ -9,7 +9,7 @@ const POLE: f64 = 0.02;
 /// A camera's pose, with the pivot that orbits go about.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Viewpoint {
-    /// The camera's centre in the world.
+    /// The camera's center in the world.
     pub position: DVec3,
     /// From camera axes (x right, y down, z forward) to the world.
     pub rotation: DQuat,
@@ -49,12 +49,10 @@ impl Viewpoint {
         Self { position, rotation, distance: ahead.max(0.1 * radius) }
     }
 
-    /// Right axis in the world.
     pub fn right(&self) -> DVec3 {
         self.rotation * DVec3::X
     }
 
-    /// Down axis in the world.
     pub fn down(&self) -> DVec3 {
         self.rotation * DVec3::Y
     }
@@ -79,14 +77,13 @@ impl Viewpoint {
         self.rotation = rotation.normalize();
     }
 
-    /// Orbits about the pivot.
     pub fn orbit(&mut self, yaw: f64, pitch: f64, up: DVec3) {
         let pivot = self.pivot();
         self.turn(yaw, pitch, up);
         self.position = pivot - self.forward() * self.distance;
     }
 
-    /// Moves so that what lies at the pivot follows the pointer: world units to the right and down.
+    /// Moves so that the pivot's plane follows the pointer: world units to the right and down.
     pub fn pan(&mut self, right: f64, down: f64) {
         self.position -= self.right() * right + self.down() * down;
     }
@@ -103,12 +100,11 @@ impl Viewpoint {
         self.position = target - self.forward() * self.distance;
     }
 
-    /// World to camera.
     pub fn viewmat(&self) -> DMat4 {
         DMat4::from_quat(self.rotation.inverse()) * DMat4::from_translation(-self.position)
     }
 
-    /// A pinhole camera with the principal point at the centre; `fov` is vertical, in radians.
+    /// A pinhole camera with the principal point at the center; `fov` is vertical, in radians.
     pub fn camera(&self, [width, height]: [u32; 2], fov: f64) -> Camera {
         let focal = 0.5 * f64::from(height) / (0.5 * fov).tan();
         Camera {
@@ -122,7 +118,7 @@ impl Viewpoint {
         }
     }
 
-    /// A part of the way to another, along an arc where they look at the same point.
+    /// Interpolates to another view, along an arc if both look at the same point.
     pub fn between(&self, other: &Self, part: f64) -> Self {
         let rotation = self.rotation.slerp(other.rotation, part);
         let distance = self.distance + (other.distance - self.distance) * part;
@@ -137,7 +133,7 @@ pub fn relative_to(mut camera: Camera, origin: [f64; 3]) -> Camera {
     camera
 }
 
-/// The camera for a picture of another size that still shows all of its own picture.
+/// The camera for a picture of another size that shows the whole original picture.
 pub fn fitted(camera: &Camera, [width, height]: [u32; 2]) -> Camera {
     let (w, h) = (f64::from(width), f64::from(height));
     let (was_w, was_h) = (f64::from(camera.width), f64::from(camera.height));
@@ -170,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn looking_puts_the_target_in_the_middle_with_up_upward() {
+    fn looking_at_a_target_centers_it_with_up_upward() {
         let camera = view().camera([200, 100], 1.0);
         camera.validate().expect("rigid");
         let p = camera.viewmat.transform_point3(DVec3::ZERO);
@@ -211,7 +207,7 @@ mod tests {
     }
 
     #[test]
-    fn zoom_pan_and_focus_move_as_they_say() {
+    fn zoom_pan_and_focus_move_the_camera() {
         let mut moved = view();
         moved.zoom(2.0);
         assert!((moved.distance - 0.5 * view().distance).abs() < 1e-12);

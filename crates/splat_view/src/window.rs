@@ -13,7 +13,7 @@ use crate::screen::{Screen, reason};
 use crate::session::{Session, Wake};
 use crate::start::Start;
 
-/// Opens a window and shows what the command line names, until it is closed.
+/// Opens a window and shows the command line's scene until it is closed.
 pub fn run(arguments: Arguments) -> Result<()> {
     let start = Start::read(&arguments)?;
     let event_loop =
@@ -26,7 +26,7 @@ pub fn run(arguments: Arguments) -> Result<()> {
     app.failure.map_or(Ok(()), Err)
 }
 
-/// Why no window opens, and what to do.
+/// The error message without a display.
 fn no_display() -> String {
     let why = if cfg!(all(unix, not(target_os = "macos"))) {
         let set = |name: &&str| {
@@ -42,18 +42,15 @@ fn no_display() -> String {
         String::new()
     };
     format!(
-        "no display answers{why}; start splat-view on a desktop, or draw without a window: \
+        "no display was found{why}; start splat-view on a desktop, or draw without a window: \
          --screenshot FILE"
     )
 }
 
-/// The program while its event loop runs.
 struct App {
     arguments: Arguments,
-    /// Taken when the window opens.
     start: Option<Start>,
     proxy: EventLoopProxy<Wake>,
-    /// None until the window is open.
     session: Option<Session>,
     /// Why the program ends, if it fails.
     failure: Option<Error>,

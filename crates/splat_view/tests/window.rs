@@ -10,26 +10,27 @@ use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 use common::dragging::drop_file;
-use common::{Folder, Picture, ball, program, read_png, refused, run, write, write_cameras};
+use common::{
+    Folder, Picture, ball, command, draw, program, read_png, refused, write, write_cameras,
+    write_in_levels,
+};
 use glam::{DMat4, DVec3};
 use splat_render::Camera;
-use splat_render::levels::write_levels;
 
 /// Longest that anything may take on a busy machine.
 const PATIENCE: Duration = Duration::from_secs(120);
-/// What a test says where a tool or a library for it is missing.
+/// Hint if a tool or a library is missing.
 const INSTALL: &str = "run `make display`, or install xvfb, xdotool, libxcursor1, libxi6, libxrandr2, \
                        libx11-xcb1 and libxkbcommon-x11-0";
 /// The window's first size; small, since a software adapter draws.
 const SIZE: [usize; 2] = [320, 240];
-/// Bounds on what a window's picture is off the rasterizer's, in 255ths, whatever draws it:
-/// docs/guides/viewing.md has them.
+/// Bounds on a window's difference from the rasterizer, in 255ths (docs/guides/viewing.md).
 const MOST: u8 = 3;
 const MEAN: f64 = 0.5;
-/// The same where the rasterizer draws in the window, too.
+/// The bound if the rasterizer draws in the window.
 const RASTERIZED_MOST: u8 = 1;
 
-/// A display of its own.
+/// A virtual display.
 struct Xvfb {
     server: Child,
     name: String,
@@ -40,17 +41,7 @@ impl Xvfb {
     fn start() -> Self {
         let folder = Folder::new();
         let mut server = Command::new("Xvfb")
-            .args([
-                "-displayfd",
-                "1",
-                "-screen",
-                "0",
-                "640x480x24",
-                "-noreset",
-                "-nolisten",
-                "tcp",
-                "-fbdir",
-            ])
+            .args("-displayfd 1 -screen 0 640x480x24 -noreset -nolisten tcp -fbdir".split(' '))
             .arg(&folder.0)
             .stdout(Stdio::piped())
             .stderr(Stdio::null())
@@ -67,7 +58,7 @@ impl Xvfb {
         self.answer(arguments).unwrap_or_else(|text| panic!("xdotool {arguments:?}: {text}"))
     }
 
-    /// What xdotool prints, as an error where it fails.
+    /// xdotool's output, an error if it fails.
     fn answer(&self, arguments: &[&str]) -> Result<String, String> {
         let output = Command::new("xdotool")
             .env("DISPLAY", &self.name)
@@ -94,14 +85,14 @@ impl Xvfb {
         }
     }
 
-    /// What the display shows in its upper left corner, from the file that Xvfb keeps it in.
+    /// The upper left corner of the display, from Xvfb's file.
     fn seen(&self, [width, height]: [usize; 2]) -> Picture {
         let bytes = std::fs::read(self.folder.join("Xvfb_screen0")).expect("the screen");
         let word = |i: usize| {
             let word: [u8; 4] = bytes[4 * i..4 * i + 4].try_into().expect("a word");
             u32::from_be_bytes(word) as usize
         };
-        // XWD: size of the header, ..., bytes of a line (13th), ..., number of colours (20th).
+        // XWD: size of the header, ..., bytes of a line (13th), ..., number of colors (20th).
         let (start, line) = (word(0) + 12 * word(19), word(12));
         let pixel = |x: usize, y: usize| {
             let at = start + y * line + 4 * x;
@@ -129,11 +120,11 @@ struct Viewer<'a> {
 }
 
 impl<'a> Viewer<'a> {
-    fn start(xvfb: &'a Xvfb, folder: &'a Path, arguments: &[&str]) -> Self {
+    fn start(xvfb: &'a Xvfb, folder: &'a Path, options: &str) -> Self {
         let mut program = program()
             .env("DISPLAY", &xvfb.name)
             .current_dir(folder)
-            .args(arguments)
+            .args(options.split(' '))
             .args(["--size", &format!("{}x{}", SIZE[0], SIZE[1])])
             .stdout(Stdio::null())
             .spawn()
@@ -169,7 +160,7 @@ impl<'a> Viewer<'a> {
 
     /// A screenshot by key.
     fn shot(&mut self) -> Picture {
-        // What came before is in it: keys are handled in their order.
+        // Keys are handled in order, so earlier ones are in the picture.
         self.key("p");
         self.shots += 1;
         let path = self.folder.join(format!("splat-view-{:03}.png", self.shots));
@@ -219,20 +210,14 @@ impl Drop for Viewer<'_> {
     }
 }
 
-/// The rasterizer's picture of a scene as it is first seen.
+/// The rasterizer's picture of a scene in its first view.
 fn rasterized(scene: &Path, size: [usize; 2]) -> Picture {
-    rasterized_with(scene, size, &[])
+    rasterized_with(scene, size, "")
 }
 
-/// The same with further arguments.
-fn rasterized_with(scene: &Path, [width, height]: [usize; 2], more: &[&str]) -> Picture {
-    let out = scene.with_extension("expected.png");
-    let size = format!("{width}x{height}");
-    let mut arguments: Vec<&dyn AsRef<std::ffi::OsStr>> =
-        vec![&scene, &"--screenshot", &out, &"--size", &size, &"--backend", &"cpu"];
-    arguments.extend(more.iter().map(|word| word as &dyn AsRef<std::ffi::OsStr>));
-    run(&arguments);
-    read_png(&out)
+/// [`rasterized`] with further options.
+fn rasterized_with(scene: &Path, [width, height]: [usize; 2], options: &str) -> Picture {
+    draw(scene, &format!("--size {width}x{height} {options}")).0
 }
 
 fn agree(name: &str, one: &Picture, other: &Picture) {
@@ -259,7 +244,7 @@ fn scenes(folder: &Folder) -> [PathBuf; 2] {
 fn a_window_draws_orbits_zooms_resizes_and_shows_what_it_saves() {
     let (xvfb, folder) = (Xvfb::start(), Folder::new());
     let [scene, _] = scenes(&folder);
-    let mut viewer = Viewer::start(&xvfb, &folder.0, &["scene0.ply", "--draw", "rasterize"]);
+    let mut viewer = Viewer::start(&xvfb, &folder.0, "scene0.ply --draw rasterize");
     let first = viewer.shot();
     assert_eq!(first.size, SIZE);
     agree("first view", &first, &rasterized(&scene, SIZE));
@@ -305,19 +290,20 @@ fn a_window_draws_orbits_zooms_resizes_and_shows_what_it_saves() {
     let resized = viewer.shot_when("the new size", |shot| shot.size == size);
     agree("after the resize", &resized, &rasterized(&scene, size));
     viewer.shows(&resized);
-    // Double click on a splat beside the middle brings it there.
+    // A double click centers a splat.
     xvfb.xdotool(&["mousemove", "230", "110", "click", "--repeat", "2", "--delay", "20", "1"]);
     let focused = viewer.shot_when("the focus", |shot| shot.apart(&resized).1 > 1.0);
     assert!(middle(&focused)[0] < middle(&resized)[0] - 5.0, "the scene did not move to the left");
 }
 
 #[test]
-fn every_display_is_another_and_keys_move_the_camera() {
+fn all_displays_differ_and_keys_move_the_camera() {
     let (xvfb, folder) = (Xvfb::start(), Folder::new());
     let [scene, _] = scenes(&folder);
-    let arguments = ["scene0.ply", "--background", "0.2,0.4,0.6", "--draw", "blend"];
-    let mut viewer = Viewer::start(&xvfb, &folder.0, &arguments);
-    agree("blended", &viewer.shot(), &rasterized_with(&scene, SIZE, &arguments[1..3]));
+    let background = "--background 0.2,0.4,0.6";
+    let options = format!("scene0.ply {background} --draw blend");
+    let mut viewer = Viewer::start(&xvfb, &folder.0, &options);
+    agree("blended", &viewer.shot(), &rasterized_with(&scene, SIZE, background));
     let mut seen: Vec<Picture> = Vec::new();
     for key in ["1", "2", "3", "4", "5"] {
         viewer.key(key);
@@ -358,7 +344,7 @@ fn two_models_are_compared_at_a_divider_and_changed_files_appear() {
     let [left, right] = scenes(&folder);
     let expected = [&left, &right].map(|scene| rasterized(scene, SIZE));
     differ("the two models", &expected[0], &expected[1]);
-    let mut viewer = Viewer::start(&xvfb, &folder.0, &["scene0.ply", "scene1.ply"]);
+    let mut viewer = Viewer::start(&xvfb, &folder.0, "scene0.ply scene1.ply");
     let halves = |picture: &Picture, at: usize| {
         agree("left", &picture.columns(0, at), &expected[0].columns(0, at));
         agree("right", &picture.columns(at, SIZE[0]), &expected[1].columns(at, SIZE[0]));
@@ -373,7 +359,7 @@ fn two_models_are_compared_at_a_divider_and_changed_files_appear() {
         shot.columns(0, 80).apart(&again.columns(0, 80)).1 < MEAN
     });
     agree("changed", &changed, &again);
-    // A broken file leaves what was there.
+    // A broken file changes nothing.
     std::fs::write(&left, "ply\nthis is none").expect("write");
     std::thread::sleep(Duration::from_secs(1));
     agree("broken", &viewer.shot(), &again);
@@ -386,7 +372,7 @@ fn a_refinement_s_folder_opens_and_a_new_scene_in_it_appears() {
     let (red, blue) = (rasterized(&red, SIZE), rasterized(&blue, SIZE));
     write(&folder.join("out/rounds/0/scene.ply"), &ball(600, 20, [0.8, 0.3, 0.2]));
     write(&folder.join("out/scene.ply"), &ball(600, 20, [0.8, 0.3, 0.2]));
-    let mut viewer = Viewer::start(&xvfb, &folder.0, &["out"]);
+    let mut viewer = Viewer::start(&xvfb, &folder.0, "out");
     agree("round 0", &viewer.shot(), &red);
     write(&folder.join("out/rounds/1/scene.ply"), &ball(600, 20, [0.2, 0.4, 0.8]));
     write(&folder.join("out/scene.ply"), &ball(600, 20, [0.2, 0.4, 0.8]));
@@ -395,21 +381,16 @@ fn a_refinement_s_folder_opens_and_a_new_scene_in_it_appears() {
 }
 
 #[test]
-fn a_scene_in_levels_gets_as_fine_as_its_budget_allows_and_follows_the_camera() {
+fn a_scene_in_levels_refines_within_its_budget_and_follows_the_camera() {
     let (xvfb, folder) = (Xvfb::start(), Folder::new());
-    let (scene, levels) = (folder.join("scene.ply"), folder.join("levels"));
-    write(&scene, &ball(3000, 20, [0.8, 0.3, 0.2]));
-    std::fs::create_dir(&levels).expect("a folder");
-    write_levels(&scene, &levels, 3, 200, &mut || true).expect("levels");
-    write_cameras(&folder.join("cameras.json"), &cameras());
+    let levels = write_in_levels(&folder, &ball(3000, 20, [0.8, 0.3, 0.2]));
     let path = folder.join("cameras.json");
-    let words = ["--cameras", path.to_str().expect("a path"), "--budget", "1500"];
-    let expected = |camera: &str| {
-        rasterized_with(&levels, SIZE, &[&words[..], &["--camera", camera]].concat())
-    };
-    let (near, far) = (expected("0"), expected("1"));
+    write_cameras(&path, &cameras());
+    let options = format!("--cameras {} --budget 1500", path.display());
+    let [near, far] =
+        [0, 1].map(|n| rasterized_with(&levels, SIZE, &format!("{options} --camera {n}")));
     differ("the cameras", &near, &far);
-    let mut viewer = Viewer::start(&xvfb, &folder.0, &[&["levels"], &words[..]].concat());
+    let mut viewer = Viewer::start(&xvfb, &folder.0, &format!("levels {options}"));
     // Coarser levels are near enough in the mean, and drawn until these are read.
     let as_fine = |shot: &Picture, expected: &Picture| {
         let (most, mean) = shot.apart(expected);
@@ -440,8 +421,8 @@ fn cameras_are_jumped_to_scenes_dropped_and_recordings_stopped() {
     let (xvfb, folder) = (Xvfb::start(), Folder::new());
     let [scene, _] = scenes(&folder);
     write_cameras(&folder.join("cameras.json"), &cameras());
-    let expected = ["0", "1", "2"].map(|n| rasterized_with(&scene, SIZE, &["--camera", n]));
-    let mut viewer = Viewer::start(&xvfb, &folder.0, &["scene0.ply"]);
+    let expected = [0, 1, 2].map(|n| rasterized_with(&scene, SIZE, &format!("--camera {n}")));
+    let mut viewer = Viewer::start(&xvfb, &folder.0, "scene0.ply");
     agree("the first picture is the first camera's", &viewer.shot(), &expected[0]);
     for (key, camera) in
         [("bracketright", 1), ("bracketright", 2), ("bracketleft", 1), ("bracketleft", 0)]
@@ -451,7 +432,7 @@ fn cameras_are_jumped_to_scenes_dropped_and_recordings_stopped() {
     }
     viewer.key("bracketleft");
     agree("around to the last camera", &viewer.shot(), &expected[2]);
-    // A click at the first camera's frustum, where the last one sees it.
+    // A click at the first camera's frustum in the last camera's picture.
     viewer.key("c");
     let [first, _, last] = cameras();
     let at = last.viewmat.transform_point3(first.center());
@@ -494,14 +475,12 @@ fn cameras_are_jumped_to_scenes_dropped_and_recordings_stopped() {
 }
 
 #[test]
-fn windows_larger_than_any_texture_are_refused_when_asked_for_and_else_go_on() {
+fn windows_larger_than_any_texture_are_refused() {
     let (xvfb, folder) = (Xvfb::start(), Folder::new());
     let [scene, _] = scenes(&folder);
-    let mut command = program();
-    command.env("DISPLAY", &xvfb.name);
-    command.args(["--size", "9000x40"]).arg(&scene);
-    refused(&command.output().expect("start"), &["--size", "up to 8192", "9000x40"]);
-    let mut viewer = Viewer::start(&xvfb, &folder.0, &["scene0.ply"]);
+    let mut command = command(&scene, "--size 9000x40");
+    refused(command.env("DISPLAY", &xvfb.name), &["--size", "up to 8192", "9000x40"]);
+    let mut viewer = Viewer::start(&xvfb, &folder.0, "scene0.ply");
     xvfb.xdotool(&["windowsize", "--sync", &viewer.window, "9000", "40"]);
     viewer.shot_when("the largest size", |shot| shot.size == [8192, 40]);
     let size = [200, 100];
@@ -514,9 +493,8 @@ fn windows_larger_than_any_texture_are_refused_when_asked_for_and_else_go_on() {
 fn without_an_adapter_an_error_message_says_so() {
     let (xvfb, folder) = (Xvfb::start(), Folder::new());
     scenes(&folder);
-    let mut command = program();
+    let mut command = command(&folder.join("scene0.ply"), "");
     command.env("DISPLAY", &xvfb.name);
     command.env("VK_DRIVER_FILES", "/nothing").env("VK_ICD_FILENAMES", "/nothing");
-    let output = command.arg(folder.join("scene0.ply")).output().expect("start");
-    refused(&output, &["no Vulkan, Metal or DX12 adapter", "mesa-vulkan-drivers"]);
+    refused(&mut command, &["no Vulkan, Metal or DX12 adapter", "mesa-vulkan-drivers"]);
 }

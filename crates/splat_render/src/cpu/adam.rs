@@ -1,4 +1,4 @@
-//! adam: one optimiser step of all parameters, a block of splats at a time.
+//! adam: one optimizer step of all parameters, a block of splats at a time.
 
 use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
@@ -83,10 +83,10 @@ pub(super) struct BlockStep {
     frozen: bool,
     rates: BlockRates,
     bias: [f32; 2],
-    /// Gradients of the regularisers by one opacity and one scale.
+    /// Gradients of the regularizers by one opacity and one scale.
     opacity_pull: f32,
     scale_pull: f32,
-    /// Floats of colour per splat: stored, and of the degree in use.
+    /// Floats of color per splat: stored, and of the degree in use.
     stored: usize,
     used: usize,
 }
@@ -107,7 +107,7 @@ impl BlockStep {
         }
     }
 
-    /// Adds the regularisers' gradients to those of a block of splats.
+    /// Adds the regularizers' gradients to a block's gradients.
     pub fn pull(&self, values: &SplatSlices<'_>, gradients: &mut BlockGradients) {
         if self.opacity_pull == 0.0 && self.scale_pull == 0.0 {
             return;
@@ -122,7 +122,7 @@ impl BlockStep {
         });
     }
 
-    /// Moves a block of splats by its gradients, colours apart.
+    /// Moves a block of splats by its gradients, colors apart.
     pub fn apply(
         &self,
         values: &mut SplatSlices<'_>,
@@ -150,7 +150,7 @@ impl BlockStep {
         adam!(opacities);
     }
 
-    /// Moves the colours of a block of splats by their gradients.
+    /// Moves the colors of a block of splats by their gradients.
     fn apply_colors(
         &self,
         values: &mut SplatSlices<'_>,
@@ -160,7 +160,7 @@ impl BlockStep {
         if self.frozen {
             return;
         }
-        // Whole blocks at once where no coefficient rests.
+        // If all coefficients are in use, the rows are contiguous.
         let (values, row) = (values.sh.as_flattened_mut(), self.stored);
         let row = if self.used == row { values.len() } else { row };
         for start in (0..values.len()).step_by(row.max(1)) {
@@ -184,8 +184,7 @@ impl BlockStep {
     }
 }
 
-/// Adam's step (Kingma and Ba, 2015, algorithm 1) of numbers with their first and second moments: what
-/// all three become. Each operation rounds by itself, so that bits are the same on every machine.
+/// Adam's step (Kingma and Ba, 2015, algorithm 1), not fused, so that bits agree on every machine.
 #[inline(always)]
 pub(super) fn step<S: Simd>(
     [value, first, second]: [Lanes<S>; 3],
@@ -200,7 +199,7 @@ pub(super) fn step<S: Simd>(
     [value - rate * (m * bias1) / size, m, v]
 }
 
-/// Adam on values, each with its own rate. All slices have room for as many as `values`.
+/// Adam on values with one rate each. All slices are at least as long as `values`.
 struct Adam<'a> {
     values: &'a mut [f32],
     first: &'a mut [f32],
@@ -234,8 +233,7 @@ impl WithSimd for Adam<'_> {
     }
 }
 
-/// Numbers with their first and second moments as whole vectors and a rest that fills none: to read a
-/// part of a vector is a call.
+/// Values and moments as whole vectors and a rest; reading a part of a vector is slow.
 pub(super) struct StateVectors<'a, S: Simd> {
     s: S,
     whole: [&'a mut [S::f32s]; 3],
@@ -294,7 +292,7 @@ impl<'a, S: Simd> StateVectors<'a, S> {
     }
 }
 
-/// What the regularisers pull at: log-scales and logits of a block, with their gradients.
+/// Log-scales and logits of a block with their gradients, for the regularizers.
 struct Pull<'a> {
     log_scales: &'a [f32],
     v_scales: &'a mut [f32],

@@ -34,9 +34,8 @@ impl ChunkTiles {
         self.counts.push(0);
     }
 
-    /// Appends the tiles that a visible splat touches: per row of tiles, the exact span of its
-    /// ellipse {alpha >= ALPHA_MIN} within the band of that row's pixel centres, a little widened
-    /// against rounding.
+    /// Appends the tiles of a visible splat: per row of tiles, the span of its ellipse {alpha >=
+    /// ALPHA_MIN} within the band of that row's pixel centers, slightly widened against rounding.
     pub fn push(&mut self, splat: &Splat2d, width: u32, height: u32) {
         let before = self.tiles.len();
         self.push_tiles(splat, width, height);
@@ -52,9 +51,8 @@ impl ChunkTiles {
         let reach = splat.reach * (1.0 + 1e-5) + 1e-5;
         let slack = |radius: f32, center: f32| 1e-2 + 4e-6 * (radius + center.abs());
         let (slack_x, slack_y) = (slack(rx, mx), slack(ry, my));
-        // The tiles whose pixel centres lie between two numbers. A tile's last pixel centre lies half
-        // a pixel before its end, hence the -0.5, and the +0.5 on the tile that ends there. The
-        // clamp makes cutting off what rounding down is.
+        // Tiles with a pixel center in [low, high]; a tile's first and last center are half a pixel
+        // inside. After the clamp, truncation rounds down.
         let tiles_of = |low: f32, high: f32, count: u32| {
             let of = |x: f32| (x / tile).clamp(0.0, (count - 1) as f32) as u32;
             of(low + 0.5)..=of(high - 0.5)
@@ -100,29 +98,24 @@ impl ChunkTiles {
 /// Fewest pairs for which a task of their own pays.
 const GROUP: usize = 1 << 14;
 
-/// Splats sorted into tiles.
 #[derive(Debug, Default)]
 pub(super) struct Bins {
     /// `[tiles + 1]` start of each tile's list.
     pub starts: Vec<u32>,
-    /// Splat ids by (tile, depth, index). Atomic, as is what follows: many tasks write, each its own
-    /// places all over it. While they are sorted, slots.
+    /// Splat ids by (tile, depth, index); slots during the sort. Atomic, since tasks interleave.
     pub splats: Vec<AtomicU32>,
     /// `[N + 1]` start of each splat's slots: a place per pair, splat-major.
     slots: Vec<u32>,
     /// Position in `splats` of each slot. While they are sorted, the slot's splat.
     position_from_slot: Vec<AtomicU32>,
-    /// By group of splats that follow each other and by tile: pairs at first, then where the
-    /// group's next pair goes.
+    /// By group of splats and by tile: the number of pairs, then the position of the next pair.
     cursors: Vec<u32>,
 }
 
 impl Bins {
-    /// Sorts the chunks' tiles. `depth(i)` is asked only for splats that touch a tile.
-    ///
-    /// Splats are put into their tiles as they lie in memory, by as many tasks as there are threads,
-    /// since each costs a look at all tiles. Then each tile's list, which fits into the cache, is
-    /// sorted by itself. No two pairs have the same place in the order, so the tasks show in no result.
+    /// Sorts the chunks' tiles. `depth(i)` is called only for splats that touch a tile. Tasks first put
+    /// splats into tiles in memory order, then sort each tile's list, which fits into the cache. All keys
+    /// differ, so the result does not depend on the tasks.
     pub fn fill(
         &mut self,
         chunks: &[ChunkTiles],
@@ -254,7 +247,6 @@ fn touched_tiles(splats: &[Option<Splat2d>], width: u32, height: u32) -> Vec<Chu
         .collect()
 }
 
-/// 2D splats, None where they are not drawn.
 fn splats2d(projected: &Projected<f32>) -> Vec<Option<Splat2d>> {
     (0..projected.len())
         .map(|i| {
@@ -271,7 +263,7 @@ fn splats2d(projected: &Projected<f32>) -> Vec<Option<Splat2d>> {
         .collect()
 }
 
-/// What the rasterize stages read.
+/// Input of the rasterize stages.
 pub(super) struct Binned {
     pub splats: Vec<TileSplat>,
     pub bins: Bins,
@@ -294,7 +286,7 @@ mod tests {
 
     use super::*;
 
-    /// The lists of many splats on any number of threads are those of a plain sort.
+    /// The lists of many splats equal a plain sort's for any number of threads.
     #[test]
     fn lists_are_sorted_by_tile_depth_and_index() {
         let mut rng = rand_pcg::Pcg64::seed_from_u64(8);
@@ -395,7 +387,7 @@ mod tests {
         assert!(needed > 10_000, "only {needed} tiles are reached");
         let excess = listed as f64 / needed as f64 - 1.0;
         println!("{listed} tiles listed, {needed} reached: {:.2} % too many", 100.0 * excess);
-        // Those that an ellipse enters between pixel centres only.
+        // Tiles that an ellipse enters only between pixel centers.
         assert!(excess < 0.03, "{listed} tiles are listed where {needed} are reached");
     }
 }

@@ -1,5 +1,4 @@
-//! A block of splats as structure of arrays, so that one vector holds the same number of several
-//! splats. It stays in the cache.
+//! A block of splats as structure of arrays, one splat per vector lane. It stays in the cache.
 
 use pulp::Simd;
 
@@ -10,7 +9,6 @@ use crate::stages::SplatParams;
 /// Splats per block: some whole vectors of any width.
 pub(super) const BLOCK: usize = 64;
 
-/// One number of each splat of a block.
 #[derive(Debug, Clone, Copy)]
 #[repr(align(64))]
 pub(super) struct Row(pub [f32; BLOCK]);
@@ -18,7 +16,6 @@ pub(super) struct Row(pub [f32; BLOCK]);
 impl Row {
     pub const ZERO: Self = Self([0.0; BLOCK]);
 
-    /// The vector `at` of the row.
     #[inline(always)]
     pub fn get<S: Simd>(&self, s: S, at: usize) -> Lanes<S> {
         Lanes::new(s, S::as_simd_f32s(&self.0).0[at])
@@ -59,7 +56,6 @@ pub(super) struct Ids {
 impl Ids {
     pub const NONE: Self = Self { ids: [0; BLOCK], len: 0 };
 
-    /// The first `len` splats.
     pub fn all(len: usize) -> Self {
         Self { ids: std::array::from_fn(|k| k as u8), len }
     }
@@ -75,14 +71,13 @@ impl Ids {
         self.len += 1;
     }
 
-    /// Appends `k` where `wanted`, without a branch.
+    /// Appends `k` if `wanted`, without a branch.
     #[inline(always)]
     pub fn push_if(&mut self, k: usize, wanted: bool) {
         self.ids[self.len] = k as u8;
         self.len += usize::from(wanted);
     }
 
-    /// Those of the first `count` splats.
     pub fn below(&self, count: usize) -> Self {
         let len = self.get().partition_point(|&k| usize::from(k) < count);
         Self { len, ..*self }
@@ -94,7 +89,7 @@ impl Ids {
     }
 }
 
-/// Parameters of a block of splats as they are given, colours apart.
+/// Parameters of a block of splats as they are given, colors apart.
 #[derive(Debug)]
 pub(super) struct SplatRows {
     pub means: [Row; 3],
@@ -111,7 +106,6 @@ impl SplatRows {
         opacities: Row::ZERO,
     };
 
-    /// The vector `at` of the quaternions.
     #[inline(always)]
     pub fn quat<S: Simd>(&self, s: S, at: usize) -> [Lanes<S>; 4] {
         let [w, x, y, z] = &self.quats;
@@ -137,7 +131,7 @@ impl SplatRows {
     }
 }
 
-/// Colour coefficients of a block of splats: row 3 k + c has channel c of coefficient k.
+/// Color coefficients of a block of splats: row 3 k + c has channel c of coefficient k.
 #[derive(Debug)]
 pub(super) struct ColorRows(pub [Row; 3 * SH_COEFFS_MAX]);
 
@@ -151,8 +145,7 @@ impl ColorRows {
         Vec3s::new(rows[0].get(s, at), rows[1].get(s, at), rows[2].get(s, at))
     }
 
-    /// Takes the first `used` coefficients of each of the splats `ids` of the block that begins with
-    /// splat `first`; `coeffs` has `stride` for each splat.
+    /// Takes the first `used` of `stride` coefficients of the splats `ids` of the block at `first`.
     #[inline(always)]
     pub fn take(
         &mut self,

@@ -5,8 +5,7 @@ use rayon::prelude::*;
 use crate::stages::{self, Image, depth_pixel};
 use crate::target::TargetDepth;
 
-/// Pixels per task: sums are taken by task and added in order, so that they do not depend on the
-/// threads.
+/// Pixels per task. Tasks' sums are added in order, so that they do not depend on the threads.
 const PART: usize = 1 << 14;
 
 /// The gradients, kept from step to step.
@@ -14,7 +13,6 @@ const PART: usize = 1 << 14;
 pub(super) struct DepthLoss {
     /// Gradient with respect to the picture's alpha.
     pub v_alpha: Vec<f32>,
-    /// Gradient with respect to the picture's accumulated depth.
     pub v_depth: Vec<f32>,
 }
 

@@ -18,8 +18,7 @@ fn power<S: Simd>(n: Lanes<S>) -> Lanes<S> {
     Lanes::new(s, s.transmute_f32s_u32s(s.wrapping_dyn_shl_u32s(bits, s.splat_u32s(23))))
 }
 
-/// e^x, relative error below 1e-7 where the result is normal: 0 and infinity where f32 holds
-/// no such number, NaN of NaN.
+/// e^x with relative error below 1e-7 for normal results; 0 and infinity outside f32's range; NaN of NaN.
 #[inline(always)]
 pub(super) fn exp<S: Simd>(x: Lanes<S>) -> Lanes<S> {
     // Of Cephes' expf: (e^r - 1 - r) / r^2 on |r| <= ln 2 / 2, from the highest power.
@@ -43,8 +42,7 @@ pub(super) fn exp<S: Simd>(x: Lanes<S>) -> Lanes<S> {
     x.eq(x).select(y, x)
 }
 
-/// ln x of a positive normal number, relative error below 1e-7. Anything else gives a number
-/// without meaning: the caller has looked.
+/// ln x of a positive normal number, relative error below 1e-7; undefined for other numbers.
 #[inline(always)]
 pub(super) fn ln<S: Simd>(x: Lanes<S>) -> Lanes<S> {
     // Of Cephes' logf: (ln(1 + f) - f + f^2 / 2) / f^3 on sqrt(1/2) <= 1 + f < sqrt(2), from the

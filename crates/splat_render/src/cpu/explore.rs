@@ -20,7 +20,7 @@ const GATE_MIN: f32 = 1e-7;
 pub(super) struct ExploreBlock {
     /// The gates of all splats of the block.
     all_gates: Row,
-    /// Which splats move; what follows has them in this order.
+    /// The splats that move; later arrays are in this order.
     ids: Ids,
     splats: SplatRows,
     gates: Row,
@@ -40,7 +40,7 @@ impl ExploreBlock {
         })
     }
 
-    /// Moves the centres of a block of raw splats, the first of them splat `first_id` of the scene.
+    /// Moves the centers of a block of raw splats, the first of them splat `first_id` of the scene.
     pub fn run(&mut self, splats: &mut SplatSlices<'_>, noise: f32, seed: u32, first_id: usize) {
         dispatch(Explore { block: self, splats, noise, seed, first_id });
     }
@@ -106,7 +106,7 @@ impl WithSimd for Explore<'_, '_> {
     }
 }
 
-/// What [`crate::fit_device::noise_normal`] makes of a draw, one splat per lane.
+/// [`crate::fit_device::noise_normal`] of a draw, one splat per lane.
 #[inline(always)]
 fn normal<S: Simd>([d0, d1, d2, d3]: [Lanes<S>; 4]) -> Vec3s<S> {
     let (r0, r1) = ((ln(d0) * -2.0).sqrt(), (ln(d2) * -2.0).sqrt());

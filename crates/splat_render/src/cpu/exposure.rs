@@ -1,12 +1,11 @@
-//! exposure and exposure_backward: a picture's colours as a photo of some gain and offset has them.
+//! exposure and exposure_backward: a picture's colors as a photo of some gain and offset has them.
 
 use rayon::prelude::*;
 
 use super::rasterize::Planes;
 use crate::stages::{Exposure, ExposureGradients, Image};
 
-/// Pixels per task: sums are taken by task and added in order, so that they do not depend on the
-/// threads.
+/// Pixels per task. Tasks' sums are added in order, so that they do not depend on the threads.
 const PART: usize = 1 << 14;
 /// Sums that run side by side, which the compiler makes vectors of.
 const LANES: usize = 16;
@@ -16,12 +15,11 @@ const LANES: usize = 16;
 pub(super) struct Exposed {
     /// R, G, B as the photo would have them.
     pub color: [Vec<f32>; 3],
-    /// Gradient with respect to the picture's alpha, where the photo has alpha.
+    /// Gradient with respect to the picture's alpha, for photos with alpha.
     pub v_alpha: Vec<f32>,
 }
 
 impl Exposed {
-    /// Corrects a picture.
     pub fn run(&mut self, image: &Planes, exposure: &Exposure<f32>) {
         let [r, g, b, _, transmittance] = &image.planes;
         let behind = exposure.behind();
@@ -45,8 +43,7 @@ impl Exposed {
         }
     }
 
-    /// Turns the gradients of the corrected colours into those of the picture, in place, with
-    /// `self.v_alpha`, and returns those of gain and offset.
+    /// Turns the corrected colors' gradients into the picture's; returns gain's and offset's.
     pub fn backward(
         &mut self,
         image: &Planes,
@@ -100,7 +97,6 @@ impl Exposed {
     }
 }
 
-/// One channel's exposure.
 #[derive(Clone, Copy)]
 struct Raw {
     gain: f32,
@@ -109,7 +105,7 @@ struct Raw {
 }
 
 impl Raw {
-    /// What of a gradient goes back; see [`Exposure`].
+    /// The part of a gradient that passes the clamp; see [`Exposure`].
     #[inline(always)]
     fn passed(self, v: f32, color: f32, t: f32) -> f32 {
         Exposure::passed(self.gain * color + self.offset + t * self.behind, v)
@@ -140,7 +136,7 @@ fn matted_sums(v: &[f32], color: &[f32], t: &[f32], b: f32) -> [f64; 2] {
     sums.map(|lanes| lanes.iter().map(|&sum| f64::from(sum)).sum())
 }
 
-/// Colours and transmittances of a picture as planes.
+/// Colors and transmittances of a picture as planes.
 fn planes(image: &Image<f32>) -> Planes {
     let mut planes = Planes::default();
     planes.resize(image.width, image.height);

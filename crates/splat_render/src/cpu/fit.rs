@@ -1,5 +1,4 @@
-//! The CPU as a fitting device: project_backward and adam run fused, a block of splats at a time, so
-//! that no gradient array of the parameters' size exists.
+//! Fitting on the CPU: project_backward and adam run fused on blocks, which saves gradient arrays.
 
 use rayon::prelude::*;
 
@@ -19,6 +18,7 @@ use super::rasterize_backward::{
 use super::simd::prefetch;
 use super::tile::TileSplat;
 use super::waiting_colors::{ColorBlock, ColorPlan, WaitingColor};
+use crate::camera::Camera;
 use crate::constants::TILE;
 use crate::error::Result;
 use crate::fit_device::{
@@ -33,7 +33,7 @@ use crate::target::Target;
 pub struct CpuFit {
     targets: Vec<Target>,
     state: FitState,
-    /// The steps that colours may be behind the other parameters, and where each splat's are.
+    /// Steps that colors have not taken yet, and the state of each splat's colors.
     steps: WaitingSteps,
     waiting: Vec<WaitingColor>,
     loss_value: f32,
@@ -84,76 +84,14 @@ impl FitDevice for CpuFit {
 
     fn step(&mut self, input: &StepInput) -> Result<()> {
         input.validate(self.targets.iter().map(|target| (target.width, target.height)))?;
-        let target = &self.targets[input.view];
         let view = View::new(&input.camera, &ProjectOptions::default());
-        let (width, height) = (target.width, target.height);
         let adam = input.adam();
         if self.steps.must_end_before(&adam) {
             self.catch_up();
         }
+        self.project(&view, input)?;
         let target = &self.targets[input.view];
-
-        // project and the first half of bin
-        let dropout = Dropout::new(input);
-        let moving = self.state.moving();
-        let FitState { splats: values, first, second, stats, .. } = &mut self.state;
-        let (n, stride, stored) = (values.len(), values.stride(), values.sh_degree);
-        let degree = input.sh_degree.min(stored);
-        let SplatArrays { means, quats, scales, opacities, sh, .. } = values;
-        let shapes =
-            SplatParams { means, quats, scales, opacities, colors: Colors::Direct(&[]), raw: true };
-        self.splats.resize(n, TileSplat::default());
-        self.waiting.resize(n, WaitingColor::default());
-        self.chunks.resize(n.div_ceil(CHUNK), ChunkTiles::default());
-        let plan = ColorPlan::new(self.steps.get(), stored, degree);
-        (
-            self.splats.par_chunks_mut(CHUNK),
-            &mut self.chunks,
-            stats.seen.par_chunks_mut(CHUNK),
-            self.waiting.par_chunks_mut(CHUNK),
-            sh.par_chunks_mut(CHUNK * stride),
-            first.sh.par_chunks_mut(CHUNK * stride),
-            second.sh.par_chunks_mut(CHUNK * stride),
-        )
-            .into_par_iter()
-            .enumerate()
-            .for_each_init(
-                || (ProjectBlock::new(), ColorBlock::new(&plan)),
-                |(block, colors),
-                 (chunk, (splats, tiles, seen, waiting, sh, first_sh, second_sh))| {
-                    tiles.clear();
-                    for (number, splats) in splats.chunks_mut(BLOCK).enumerate() {
-                        let start = number * BLOCK;
-                        let first = chunk * CHUNK + start;
-                        let ids = dropout.kept(first, splats.len());
-                        let shown = block.shapes(&view, &shapes, first, ids, dropout.compensation);
-                        let rows = start * stride..(start + splats.len()) * stride;
-                        let waiting = &mut waiting[start..start + splats.len()];
-                        let arrays = [&mut *sh, first_sh, second_sh].map(|a| &mut a[rows.clone()]);
-                        colors.run(
-                            &plan,
-                            shown.below(moving.saturating_sub(first)),
-                            waiting,
-                            arrays,
-                        );
-                        let coeffs = &sh[rows];
-                        block.colors(&view, Colors::Sh { degree, stride, coeffs }, 0);
-                        let mut next = 0;
-                        for (k, splat) in block.visible() {
-                            (next..k).for_each(|_| tiles.push_culled());
-                            splats[k] = TileSplat::new(&splat);
-                            tiles.push(&splat, width, height);
-                            seen[start + k] += 1.0;
-                            next = k + 1;
-                        }
-                        (next..splats.len()).for_each(|_| tiles.push_culled());
-                    }
-                },
-            );
-        let tiles = width.div_ceil(TILE) * height.div_ceil(TILE);
-        let splats = &self.splats;
-        self.bins.fill(&self.chunks, tiles as usize, |i| splats[i].depth)?;
-
+        let (width, height) = (target.width, target.height);
         self.image.resize(width, height);
         let depth = target.depth.as_ref().filter(|_| input.depth_weight > 0.0);
         let (splats, bins) = (&self.splats, &self.bins);
@@ -190,26 +128,25 @@ impl FitDevice for CpuFit {
             v_depth: None,
         };
         let size = [width as f32, height as f32];
-        let Some(depth) = depth else {
+        if let Some(depth) = depth {
+            let [.., accumulated, transmittance] = &self.image.planes;
+            let weight = input.depth_weight;
+            self.loss_value += self.depth_loss.run(accumulated, transmittance, depth, weight);
+            if let Some(v_alpha) = v_alpha {
+                self.depth_loss.v_alpha.iter_mut().zip(v_alpha).for_each(|(sum, v)| *sum += v);
+            }
+            picture.v_alpha = Some(&self.depth_loss.v_alpha);
+            picture.v_depth = Some(&self.depth_loss.v_depth);
+            rasterize_backward_tiles(&self.splats, &self.bins, picture, &mut self.depth_sums);
+            let sums = std::mem::take(&mut self.depth_sums);
+            self.update(&view, input, size, &sums);
+            self.depth_sums = sums;
+        } else {
             rasterize_backward_tiles(&self.splats, &self.bins, picture, &mut self.sums);
             let sums = std::mem::take(&mut self.sums);
             self.update(&view, input, size, &sums);
             self.sums = sums;
-            self.steps.add(&adam);
-            return Ok(());
-        };
-        let [.., accumulated, transmittance] = &self.image.planes;
-        let weight = input.depth_weight;
-        self.loss_value += self.depth_loss.run(accumulated, transmittance, depth, weight);
-        if let Some(v_alpha) = v_alpha {
-            self.depth_loss.v_alpha.iter_mut().zip(v_alpha).for_each(|(sum, v)| *sum += v);
         }
-        picture.v_alpha = Some(&self.depth_loss.v_alpha);
-        picture.v_depth = Some(&self.depth_loss.v_depth);
-        rasterize_backward_tiles(&self.splats, &self.bins, picture, &mut self.depth_sums);
-        let sums = std::mem::take(&mut self.depth_sums);
-        self.update(&view, input, size, &sums);
-        self.depth_sums = sums;
         self.steps.add(&adam);
         Ok(())
     }
@@ -227,7 +164,7 @@ impl FitDevice for CpuFit {
     }
 }
 
-/// Which splats a step leaves out, and what it multiplies the others' opacities by.
+/// Selects the splats that a step drops, and scales the opacities of the rest.
 struct Dropout {
     seed: u32,
     rate: f32,
@@ -264,14 +201,77 @@ struct Scratch {
 }
 
 impl CpuFit {
-    /// Colours of splats that are not seen wait for at most so many steps, by default
-    /// [`COLOR_WAIT`](crate::fit::COLOR_WAIT); with 1, all are brought up to date in every step. Bits are
-    /// the same.
+    /// Limits the steps that colors of unseen splats wait, by default to
+    /// [`COLOR_WAIT`](crate::fit::COLOR_WAIT). The bits do not change.
     pub fn with_color_wait(self, steps: usize) -> Self {
         Self { steps: WaitingSteps::at_most(steps), ..self }
     }
 
-    /// Brings all colours up to date.
+    /// project and bin, with colors of visible splats brought up to date.
+    fn project(&mut self, view: &View, input: &StepInput) -> Result<()> {
+        let Camera { width, height, .. } = input.camera;
+        let dropout = Dropout::new(input);
+        let moving = self.state.moving();
+        let FitState { splats: values, first, second, stats, .. } = &mut self.state;
+        let (n, stride, stored) = (values.len(), values.stride(), values.sh_degree);
+        let degree = input.sh_degree.min(stored);
+        let SplatArrays { means, quats, scales, opacities, sh, .. } = values;
+        let shapes =
+            SplatParams { means, quats, scales, opacities, colors: Colors::Direct(&[]), raw: true };
+        self.splats.resize(n, TileSplat::default());
+        self.waiting.resize(n, WaitingColor::default());
+        self.chunks.resize(n.div_ceil(CHUNK), ChunkTiles::default());
+        let plan = ColorPlan::new(self.steps.get(), stored, degree);
+        (
+            self.splats.par_chunks_mut(CHUNK),
+            &mut self.chunks,
+            stats.seen.par_chunks_mut(CHUNK),
+            self.waiting.par_chunks_mut(CHUNK),
+            sh.par_chunks_mut(CHUNK * stride),
+            first.sh.par_chunks_mut(CHUNK * stride),
+            second.sh.par_chunks_mut(CHUNK * stride),
+        )
+            .into_par_iter()
+            .enumerate()
+            .for_each_init(
+                || (ProjectBlock::new(), ColorBlock::new(&plan)),
+                |(block, colors),
+                 (chunk, (splats, tiles, seen, waiting, sh, first_sh, second_sh))| {
+                    tiles.clear();
+                    for (number, splats) in splats.chunks_mut(BLOCK).enumerate() {
+                        let start = number * BLOCK;
+                        let first = chunk * CHUNK + start;
+                        let ids = dropout.kept(first, splats.len());
+                        let shown = block.shapes(view, &shapes, first, ids, dropout.compensation);
+                        let rows = start * stride..(start + splats.len()) * stride;
+                        let waiting = &mut waiting[start..start + splats.len()];
+                        let arrays = [&mut *sh, first_sh, second_sh].map(|a| &mut a[rows.clone()]);
+                        colors.run(
+                            &plan,
+                            shown.below(moving.saturating_sub(first)),
+                            waiting,
+                            arrays,
+                        );
+                        let coeffs = &sh[rows];
+                        block.colors(view, Colors::Sh { degree, stride, coeffs }, 0);
+                        let mut next = 0;
+                        for (k, splat) in block.visible() {
+                            (next..k).for_each(|_| tiles.push_culled());
+                            splats[k] = TileSplat::new(&splat);
+                            tiles.push(&splat, width, height);
+                            seen[start + k] += 1.0;
+                            next = k + 1;
+                        }
+                        (next..splats.len()).for_each(|_| tiles.push_culled());
+                    }
+                },
+            );
+        let tiles = width.div_ceil(TILE) * height.div_ceil(TILE);
+        let splats = &self.splats;
+        self.bins.fill(&self.chunks, tiles as usize, |i| splats[i].depth)
+    }
+
+    /// Brings all colors up to date.
     fn catch_up(&mut self) {
         if self.steps.get().is_empty() {
             return;
@@ -296,7 +296,7 @@ impl CpuFit {
         self.forget();
     }
 
-    /// Begins anew, from colours that are up to date.
+    /// Restarts the wait; all colors are up to date.
     fn forget(&mut self) {
         self.steps.clear();
         self.waiting.clear();

@@ -1,7 +1,5 @@
-//! Arithmetic on lanes: numbers and 3-vectors of as many splats as a vector register has room for.
-//!
-//! Operators, so that formulas read as they do for one splat. They are functions that are always
-//! inlined, not closures, for the reason that `simd.rs` gives.
+//! Arithmetic on lanes: numbers and 3-vectors, one splat per vector lane. Operators keep formulas
+//! readable; they are always-inlined functions, not closures (see `simd.rs`).
 
 use std::ops::{Add, BitAnd, Div, Mul, Neg, Not, Sub};
 
@@ -10,7 +8,6 @@ use pulp::Simd;
 
 use crate::sh::Number;
 
-/// One number per lane.
 #[derive(Clone, Copy)]
 pub(super) struct Lanes<S: Simd> {
     s: S,
@@ -45,13 +42,12 @@ impl<S: Simd> Lanes<S> {
         self.s
     }
 
-    /// The same number in every lane.
     #[inline(always)]
     pub fn all(self, value: f32) -> Self {
         Self::splat(self.s, value)
     }
 
-    /// `self * factor + summand`, rounded once where there is an instruction for it.
+    /// `self * factor + summand`, rounded once if the machine has fused multiply-add.
     #[inline(always)]
     pub fn mul_add(self, factor: Self, summand: Self) -> Self {
         Self { s: self.s, v: self.s.mul_add_e_f32s(self.v, factor.v, summand.v) }
@@ -72,13 +68,13 @@ impl<S: Simd> Lanes<S> {
         Self { s: self.s, v: self.s.abs_f32s(self.v) }
     }
 
-    /// The smaller one; either where one is NaN.
+    /// The smaller one; either one if one is NaN.
     #[inline(always)]
     pub fn min(self, other: Self) -> Self {
         Self { s: self.s, v: self.s.min_f32s(self.v, other.v) }
     }
 
-    /// The larger one; either where one is NaN.
+    /// The larger one; either one if one is NaN.
     #[inline(always)]
     pub fn max(self, other: Self) -> Self {
         Self { s: self.s, v: self.s.max_f32s(self.v, other.v) }
@@ -118,13 +114,13 @@ impl<S: Simd> Number for Lanes<S> {
 }
 
 impl<S: Simd> Mask<S> {
-    /// `yes` where true, `no` elsewhere.
+    /// `yes` in true lanes, `no` elsewhere.
     #[inline(always)]
     pub fn select(self, yes: Lanes<S>, no: Lanes<S>) -> Lanes<S> {
         Lanes { s: self.s, v: self.s.select_f32s(self.v, yes.v, no.v) }
     }
 
-    /// `yes` where true, zero elsewhere.
+    /// `yes` in true lanes, zero elsewhere.
     #[inline(always)]
     pub fn keep(self, yes: Lanes<S>) -> Lanes<S> {
         self.select(yes, yes.all(0.0))
@@ -209,7 +205,6 @@ impl<S: Simd> Add<f32> for Lanes<S> {
     }
 }
 
-/// One 3-vector per lane.
 #[derive(Clone, Copy)]
 pub(super) struct Vec3s<S: Simd> {
     pub x: Lanes<S>,
@@ -252,7 +247,6 @@ impl<S: Simd> Vec3s<S> {
         }
     }
 
-    /// `self * factor + summand`.
     #[inline(always)]
     pub fn mul_add(self, factor: Lanes<S>, summand: Self) -> Self {
         Self {
@@ -284,7 +278,6 @@ impl<S: Simd> Sub for Vec3s<S> {
     }
 }
 
-/// Component by component.
 impl<S: Simd> Mul for Vec3s<S> {
     type Output = Self;
     #[inline(always)]
@@ -330,7 +323,6 @@ impl<S: Simd> Mat3s<S> {
         ])
     }
 
-    /// The transpose times a vector.
     #[inline(always)]
     pub fn transpose_mul(self, v: Vec3s<S>) -> Vec3s<S> {
         let Self([x, y, z]) = self;

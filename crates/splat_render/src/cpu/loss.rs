@@ -1,8 +1,7 @@
 //! loss: L1 and D-SSIM of a picture against a photo, with the picture's gradient.
 //!
-//! One sweep over the rows: as soon as the window around a row is there, SSIM's slopes in it are
-//! computed, and as soon as there are slopes around a row, its gradient. Only the rows that windows
-//! still reach are kept, in rings that fit into the cache.
+//! One sweep over the rows: SSIM's slopes of a row follow once its window is complete, and its gradient
+//! once the slopes around it are. Rings that fit into the cache keep the rows within reach.
 
 use std::ops::Range;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -19,8 +18,7 @@ use crate::constants::SSIM_C;
 use crate::stages::{self, Image};
 use crate::target::Target;
 
-/// Rows that a task is to have, about: the 2 [`HALF`] rows that it reads on either side of its own
-/// cost a tenth of them, and there are some tasks for each of many threads.
+/// Approximate rows per task: far more than the 4 [`HALF`] extra rows that it reads.
 const BAND: usize = 96;
 
 /// The loss's gradient and scratch memory, kept from step to step.
@@ -28,20 +26,19 @@ const BAND: usize = 96;
 pub(super) struct Loss {
     /// Gradient of the loss with respect to each channel of the picture.
     pub v_color: [Vec<f32>; 3],
-    /// What tasks left behind that are done.
+    /// Scratch memory of finished tasks.
     scratch: Mutex<Vec<Aligned>>,
 }
 
 /// A band of rows of one channel.
 struct Band<'a> {
-    /// The picture's channel.
     x: &'a [f32],
     photo: &'a Target,
     channel: usize,
-    /// What a photo with alpha lies over.
+    /// Background behind a photo with alpha.
     background: f32,
     rows: Range<usize>,
-    /// What one unit of |x - y| and of SSIM weighs in the loss.
+    /// Weights of one unit of |x - y| and of SSIM in the loss.
     l1: f32,
     ssim: f32,
     scratch: &'a mut Aligned,
@@ -50,25 +47,18 @@ struct Band<'a> {
 
 /// Maps of a ring of pictures: the picture and the photo, zero beyond them.
 const PICTURES: usize = 2;
-/// Maps of a ring of slopes: by how much the loss falls with the filtered x, how it grows with half
-/// of the filtered xx, and how it falls with the filtered xy, through SSIM.
+/// Maps of a ring of slopes of the loss by the filtered x (negated), xx (halved) and xy (negated).
 const SLOPES: usize = 3;
-/// Filtered maps that SSIM is made of: x, y, xx + yy and xy. It takes the two variances only as a
-/// sum.
+/// Filtered maps for SSIM: x, y, xx + yy and xy; only the sum of the variances is needed.
 const MEANS: usize = 4;
 
 /// A band's scratch memory. Rings have all rows of a vector side by side.
 struct Memory<'a, V> {
-    /// Vectors of a row.
     vectors: usize,
-    /// [`PICTURES`] maps.
     pictures: &'a mut [[V; SLOTS]],
-    /// [`SLOPES`] maps.
     slopes: &'a mut [[V; SLOTS]],
-    /// [`STEP`] rows of each of [`MEANS`] maps, filtered along the columns, with [`HALF`] vectors
-    /// before and after each row.
+    /// [`STEP`] rows of [`MEANS`] maps, filtered along columns, padded by [`HALF`] vectors.
     filtered: &'a mut [V],
-    /// A row's gradient.
     gradient: &'a mut [V],
     /// A row as it lies in a picture, zero beyond its width.
     row: &'a mut [V],
@@ -105,7 +95,7 @@ impl<'a, V: bytemuck::Pod> Memory<'a, V> {
             row,
             weights,
         };
-        // Those of a photo that has none.
+        // The weights of a photo without weights.
         let values = memory.row();
         values[..width].fill(1.0);
         memory.put_weights::<S>();
@@ -135,7 +125,6 @@ impl<'a, V: bytemuck::Pod> Memory<'a, V> {
         spread::<S>(row, &mut ring[at..], PICTURES * SLOTS * S::F32_LANES);
     }
 
-    /// Makes `row` the weights.
     #[inline(always)]
     fn put_weights<S: Simd<f32s = V>>(&mut self) {
         let row = bytemuck::cast_slice::<V, f32>(self.row);
@@ -167,9 +156,8 @@ impl WithSimd for Band<'_> {
     }
 }
 
-/// The sweep. It counts rows from the first one that the band's windows reach, 2 [`HALF`] before
-/// it. The step at row `at` takes in rows from there on, has slopes of those HALF rows before them,
-/// and the gradient of those HALF rows before these.
+/// The sweep. Rows count from the first one within reach, 2 [`HALF`] before the band. The step at row
+/// `at` takes in rows from `at` on, slopes of rows HALF before, and gradients 2 HALF before.
 impl Band<'_> {
     /// The picture's row that a sweep's row is, if there is one.
     #[inline(always)]
@@ -199,7 +187,6 @@ impl Band<'_> {
         }
     }
 
-    /// Takes in the weights of a row of the picture.
     #[inline(always)]
     fn weigh<S: Simd>(&self, memory: &mut Memory<'_, S::f32s>, row: usize) {
         if let Some(weights) = &self.photo.weights {
@@ -209,8 +196,7 @@ impl Band<'_> {
         }
     }
 
-    /// Filters the pictures and puts the slopes of SSIM into their ring; returns the weighted sum of
-    /// SSIM over those rows that are the band's own.
+    /// Computes the next rows of slopes; returns the weighted sum of SSIM over the band's rows.
     #[inline(always)]
     fn slopes<S: Simd>(&self, s: S, memory: &mut Memory<'_, S::f32s>, at: usize) -> f64 {
         let vectors = memory.vectors;
@@ -266,8 +252,7 @@ impl Band<'_> {
         total
     }
 
-    /// Filters the slopes and writes the gradient of those rows that are the band's own; returns the
-    /// weighted sum of |x - y| over them.
+    /// Writes the next rows of the gradient; returns the weighted sum of |x - y| over the band's rows.
     #[inline(always)]
     fn gradient<S: Simd>(&mut self, s: S, memory: &mut Memory<'_, S::f32s>, at: usize) -> f64 {
         let (vectors, width) = (memory.vectors, self.photo.width as usize);
@@ -336,7 +321,7 @@ impl Band<'_> {
             let difference = s.sub_f32s(x, y);
             let distance = s.max_f32s(difference, s.sub_f32s(y, x));
             *sum = s.mul_add_e_f32s(distance, weight, *sum);
-            // The distance has no slope where it is 0.
+            // |x - y| has slope 0 at 0.
             let below = s.less_than_f32s(difference, zero);
             let sign = s.select_f32s(below, minus_l1, zero);
             let sign = s.select_f32s(s.greater_than_f32s(difference, zero), l1, sign);
@@ -346,7 +331,7 @@ impl Band<'_> {
     }
 }
 
-/// `N` vectors of a row of slopes, from `k` on, where one of SSIM weighs `unit`; adds w SSIM to `sum`.
+/// Computes `N` vectors of slopes from vector `k` on, at SSIM's weight `unit`; adds w SSIM to `sum`.
 #[inline(always)]
 fn slopes_of<S: Simd, const N: usize>(
     s: S,
@@ -390,8 +375,7 @@ fn slopes_of<S: Simd, const N: usize>(
     }
 }
 
-/// Rows of the bands of a picture of so many rows, from its size alone, so that no sum depends on
-/// the threads.
+/// Rows per band. Depends only on the picture's height, so that sums do not depend on the threads.
 fn rows_of_bands(height: usize) -> usize {
     let bands = ((height + BAND / 2) / BAND).max(1);
     height.div_ceil(bands).next_multiple_of(STEP)
@@ -466,128 +450,19 @@ pub(super) fn loss(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::constants::SSIM_WINDOW;
     use rand::{Rng, SeedableRng};
 
-    /// The loss in f64, straight from its definition.
-    fn plain(
-        x: &[Vec<f64>; 3],
-        y: &[Vec<f32>; 3],
-        weights: Option<&[f32]>,
-        width: usize,
-        ssim_weight: f64,
-    ) -> f64 {
-        let height = x[0].len() / width;
-        let (c1, c2) = (f64::from(SSIM_C.0), f64::from(SSIM_C.1));
-        let (mut sum, mut total) = (0.0, 0.0);
-        for row in 0..height {
-            for column in 0..width {
-                let w = weights.map_or(1.0, |w| f64::from(w[row * width + column]));
-                total += f64::from(u8::from(w > 0.0));
-                for c in 0..3 {
-                    let mut m = [0.0f64; 5];
-                    for i in 0..11 {
-                        for j in 0..11 {
-                            let (r, k) = (row + i, column + j);
-                            if r < 5 || k < 5 || r - 5 >= height || k - 5 >= width {
-                                continue;
-                            }
-                            let at = (r - 5) * width + k - 5;
-                            let g = f64::from(SSIM_WINDOW[i]) * f64::from(SSIM_WINDOW[j]);
-                            let (x, y) = (x[c][at], f64::from(y[c][at]));
-                            for (m, v) in m.iter_mut().zip([x, y, x * x, y * y, x * y]) {
-                                *m += g * v;
-                            }
-                        }
-                    }
-                    let [mx, my, xx, yy, xy] = m;
-                    let ssim = (2.0 * mx * my + c1) * (2.0 * (xy - mx * my) + c2)
-                        / ((mx * mx + my * my + c1) * (xx - mx * mx + yy - my * my + c2));
-                    let at = row * width + column;
-                    let l1 = (x[c][at] - f64::from(y[c][at])).abs();
-                    sum += w / 3.0 * ((1.0 - ssim_weight) * l1 + ssim_weight * (1.0 - ssim));
-                }
-            }
-        }
-        sum / total
-    }
-
-    fn photo(rng: &mut impl Rng, width: usize, height: usize, weighted: bool) -> Target {
-        let pixels = width * height;
-        let mut weight = || {
-            let w = rng.random::<f32>();
-            if w < 0.3 { 0.0 } else { w }
-        };
-        Target {
-            width: width as u32,
-            height: height as u32,
-            channels: 3,
-            weights: weighted.then(|| (0..pixels).map(|_| weight()).collect()),
-            pixels: (0..3 * pixels).map(|_| rng.random()).collect(),
-            depth: None,
-            background: None,
-            turns: 1,
-            until: None,
-        }
-    }
-
-    fn planes(photo: &Target) -> [Vec<f32>; 3] {
-        std::array::from_fn(|c| {
-            photo.pixels.chunks_exact(3).map(|pixel| f32::from(pixel[c]) / 255.0).collect()
-        })
-    }
-
-    #[test]
-    fn loss_and_gradient_match_the_definition() {
-        let mut rng = rand_pcg::Pcg64::seed_from_u64(3);
-        for (width, height, weighted) in [(23, 37, false), (40, 9, true), (3, 2, false)] {
-            let n = width * height;
-            let x: [Vec<f32>; 3] =
-                std::array::from_fn(|_| (0..n).map(|_| rng.random::<f32>()).collect());
-            let photo = photo(&mut rng, width, height, weighted);
-            let mut loss = Loss::default();
-            let value = loss.run([&x[0], &x[1], &x[2]], &photo, [0.0; 3], 0.2);
-            let (y, weights) = (planes(&photo), photo.weights);
-            let wide = x.clone().map(|p| p.into_iter().map(f64::from).collect::<Vec<f64>>());
-            let expected = plain(&wide, &y, weights.as_deref(), width, 0.2);
-            assert!((f64::from(value) - expected).abs() < 1e-6, "{value} vs {expected}");
-            let largest =
-                loss.v_color.iter().flatten().fold(0.0f64, |a, v| a.max(f64::from(v.abs())));
-            for pick in 0..20 {
-                let (c, at) = (pick % 3, (pick * 7919) % n);
-                let h = 1e-6;
-                let (mut low, mut high) = (wide.clone(), wide.clone());
-                low[c][at] -= h;
-                high[c][at] += h;
-                let numeric = (plain(&high, &y, weights.as_deref(), width, 0.2)
-                    - plain(&low, &y, weights.as_deref(), width, 0.2))
-                    / (2.0 * h);
-                let got = f64::from(loss.v_color[c][at]);
-                assert!(
-                    (got - numeric).abs() <= 1e-4 * largest,
-                    "{width}x{height} channel {c} pixel {at}: {got} vs {numeric}"
-                );
-            }
-        }
-    }
-
-    #[test]
-    fn a_photo_masked_out_everywhere_asks_for_nothing() {
-        let x = vec![0.3f32; 12];
-        let mut rng = rand_pcg::Pcg64::seed_from_u64(4);
-        let photo = Target { weights: Some(vec![0.0; 12]), ..photo(&mut rng, 4, 3, false) };
-        let mut loss = Loss::default();
-        let value = loss.run([&x; 3], &photo, [0.0; 3], 0.2);
-        assert_eq!(value, 0.0);
-        assert!(loss.v_color.iter().flatten().all(|&v| v == 0.0));
-    }
-
-    /// Also with scratch memory that a picture of another size has left behind.
+    /// Also with scratch memory from pictures of other sizes.
     #[test]
     fn threads_and_earlier_pictures_change_no_bit() {
         let mut rng = rand_pcg::Pcg64::seed_from_u64(5);
-        let photos = [(70, 300, true), (7, 20, false), (333, 150, false)]
-            .map(|(width, height, weighted)| photo(&mut rng, width, height, weighted));
+        let photos = [(70, 300, true), (7, 20, false), (333, 150, false)];
+        let photos = photos.map(|(width, height, weighted)| {
+            let pixels = (width * height) as usize;
+            let colors = (0..3 * pixels).map(|_| rng.random()).collect();
+            let weights = weighted.then(|| (0..pixels).map(|_| rng.random()).collect());
+            Target { weights, ..Target::new(width, height, 3, colors) }
+        });
         let x: Vec<f32> = (0..333 * 150).map(|_| rng.random()).collect();
         let run = |threads: usize, kept: bool| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();

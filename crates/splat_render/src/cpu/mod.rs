@@ -31,7 +31,7 @@ use crate::camera::Camera;
 use crate::error::Result;
 use crate::stages::{
     AdamState, AdamStep, DepthLoss, Exposure, ExposureGradients, Image, ImageGradients, Loss,
-    ProjectOptions, Projected, ProjectedGradients, SplatGradients, SplatParams, Stages, check,
+    ProjectOptions, Projected, ProjectedGradients, SplatGradients, SplatParams, Stages,
 };
 use crate::target::{Target, TargetDepth};
 
@@ -40,22 +40,24 @@ use crate::target::{Target, TargetDepth};
 pub struct Cpu;
 
 impl Stages<f32> for Cpu {
-    fn project(
+    fn project_unchecked(
         &self,
         splats: &SplatParams<'_, f32>,
         camera: &Camera,
         options: &ProjectOptions,
     ) -> Result<Projected<f32>> {
-        check::project(splats, camera, options)?;
         Ok(project::project(splats, camera, options))
     }
 
-    fn rasterize(&self, projected: &Projected<f32>, background: [f32; 3]) -> Result<Image<f32>> {
-        projected.validate()?;
+    fn rasterize_unchecked(
+        &self,
+        projected: &Projected<f32>,
+        background: [f32; 3],
+    ) -> Result<Image<f32>> {
         rasterize::rasterize(projected, background)
     }
 
-    fn rasterize_backward(
+    fn rasterize_backward_unchecked(
         &self,
         projected: &Projected<f32>,
         _background: [f32; 3],
@@ -63,11 +65,10 @@ impl Stages<f32> for Cpu {
         v_image: &ImageGradients<f32>,
         absolute: bool,
     ) -> Result<ProjectedGradients<f32>> {
-        check::rasterize_backward(projected, image, v_image)?;
         rasterize_backward::rasterize_backward(projected, image, v_image, absolute)
     }
 
-    fn project_backward(
+    fn project_backward_unchecked(
         &self,
         splats: &SplatParams<'_, f32>,
         camera: &Camera,
@@ -75,48 +76,50 @@ impl Stages<f32> for Cpu {
         projected: &Projected<f32>,
         v_projected: &ProjectedGradients<f32>,
     ) -> Result<SplatGradients<f32>> {
-        check::project_backward(splats, camera, options, projected, v_projected)?;
         Ok(project_backward::project_backward(splats, camera, options, projected, v_projected))
     }
 
-    fn exposure(&self, image: &Image<f32>, exposure: &Exposure<f32>) -> Result<Vec<[f32; 3]>> {
-        check::exposure(image, exposure)?;
+    fn exposure_unchecked(
+        &self,
+        image: &Image<f32>,
+        exposure: &Exposure<f32>,
+    ) -> Result<Vec<[f32; 3]>> {
         Ok(exposure::exposure(image, exposure))
     }
 
-    fn exposure_backward(
+    fn exposure_backward_unchecked(
         &self,
         image: &Image<f32>,
         exposure: &Exposure<f32>,
         v_corrected: &[[f32; 3]],
     ) -> Result<ExposureGradients<f32>> {
-        check::exposure_backward(image, exposure, v_corrected)?;
         Ok(exposure::exposure_backward(image, exposure, v_corrected))
     }
 
-    fn loss(
+    fn loss_unchecked(
         &self,
         image: &Image<f32>,
         target: &Target,
         background: [f32; 3],
         ssim_weight: f32,
     ) -> Result<Loss<f32>> {
-        check::loss(image, target, ssim_weight)?;
         Ok(loss::loss(image, target, background, ssim_weight))
     }
 
-    fn depth_loss(&self, image: &Image<f32>, target: &TargetDepth) -> Result<DepthLoss<f32>> {
-        check::depth_loss(image, target)?;
+    fn depth_loss_unchecked(
+        &self,
+        image: &Image<f32>,
+        target: &TargetDepth,
+    ) -> Result<DepthLoss<f32>> {
         Ok(depth_loss::depth_loss(image, target))
     }
 
-    fn adam(
+    fn adam_unchecked(
         &self,
         state: &mut AdamState<f32>,
         gradients: &SplatGradients<f32>,
         step: &AdamStep,
     ) -> Result<()> {
-        check::adam(state, gradients, step)?;
         adam::adam(state, gradients, step);
         Ok(())
     }

@@ -5,8 +5,7 @@ use std::time::{Duration, Instant};
 
 use pulp::{Simd, WithSimd};
 
-/// Chains of dependent multiply-adds per thread. Two units of four cycles' latency need eight; twelve
-/// still leave room for the factor and the summand in sixteen registers.
+/// Chains of dependent multiply-adds per thread: more than two units' latency, within 16 registers.
 const CHAINS: usize = 12;
 
 /// Rounds between two looks at the clock: about 10 us.
@@ -38,9 +37,8 @@ impl WithSimd for Chains {
     }
 }
 
-/// Floating-point operations per second, in 10^9, of multiply-adds in registers on all of rayon's
-/// threads for about `duration`, with the instruction set that the kernels run with. A multiply-add
-/// counts as two.
+/// Speed of multiply-adds in registers on all of rayon's threads in Gflop/s, measured for about
+/// `duration`. A multiply-add counts as two.
 pub fn peak_multiply_add(duration: Duration) -> f64 {
     let counts = rayon::broadcast(|_| {
         let arch = pulp::Arch::new();
@@ -74,7 +72,7 @@ mod tests {
     }
 
     #[test]
-    fn the_peak_is_a_sane_number() {
+    fn the_peak_is_plausible() {
         let peak = peak_multiply_add(Duration::from_millis(5));
         assert!((0.1..1e5).contains(&peak), "{peak} GFLOP/s");
     }

@@ -67,12 +67,11 @@ pub(super) struct Splats<S: Simd> {
     pub opacity: Lanes<S>,
     /// Derivative of the opacity with respect to the parameter as given.
     pub opacity_slope: Lanes<S>,
-    /// Whether scales and opacity were given as finite numbers. A log-scale of -inf or a logit of
-    /// +inf is poisoned too, though what it stands for is finite.
+    /// Whether scales and opacity were given as finite numbers; -inf and +inf count as invalid.
     pub given: Mask<S>,
 }
 
-/// The sigmoid of a logit and its derivative, o (1 - o), which keeps its digits where o rounds to 1.
+/// The sigmoid of a logit and its derivative, o (1 - o), which stays accurate when o rounds to 1.
 #[inline(always)]
 pub(super) fn sigmoid<S: Simd>(logit: Lanes<S>) -> (Lanes<S>, Lanes<S>) {
     let (one, e) = (logit.all(1.0), exp(-logit.abs()));
@@ -82,8 +81,7 @@ pub(super) fn sigmoid<S: Simd>(logit: Lanes<S>) -> (Lanes<S>, Lanes<S>) {
 }
 
 impl<S: Simd> Splats<S> {
-    /// The vector `at` of a block's splats, their opacities multiplied by `compensation`; scales
-    /// are logarithms and opacities logits if `raw`.
+    /// The vector `at` of a block, opacities times `compensation`; raw parameters if `raw`.
     #[inline(always)]
     pub fn load(s: S, rows: &SplatRows, at: usize, raw: bool, compensation: f32) -> Self {
         let (scales, opacity) = (get3(&rows.scales, s, at), rows.opacities.get(s, at));
@@ -106,11 +104,10 @@ impl<S: Simd> Splats<S> {
     }
 }
 
-/// What both directions of the stage need of splats.
+/// Quantities of splats that forward and backward share.
 #[derive(Clone, Copy)]
 pub(super) struct Geometry<S: Simd> {
-    /// False where a splat is culled for its own values or its depth; nothing else of it has a
-    /// meaning then.
+    /// False if a splat is culled by its values or its depth; its other fields are then undefined.
     pub drawn: Mask<S>,
     pub t: Vec3s<S>,
     pub inverse_z: Lanes<S>,
@@ -181,7 +178,7 @@ pub(super) struct Ellipses<S: Simd> {
     pub variances: [Lanes<S>; 2],
     /// m0 x m1; its length is the root of the determinant without blur.
     pub area: Vec3s<S>,
-    /// What the opacity is multiplied by; 1 if not antialiased.
+    /// Factor of the opacity; 1 if not antialiased.
     pub compensation: Lanes<S>,
 }
 
@@ -208,7 +205,7 @@ pub(super) fn ellipses<S: Simd>(view: &View, scales: Vec3s<S>, g: &Geometry<S>) 
     }
 }
 
-/// Unit view direction in the world and the length it was normalised by.
+/// Unit view direction in the world and the length it was normalized by.
 #[inline(always)]
 pub(super) fn direction<S: Simd>(view: &View, t: Vec3s<S>) -> (Vec3s<S>, Lanes<S>) {
     let along = to_world(view.axes(t.x.simd()), t);
@@ -217,7 +214,7 @@ pub(super) fn direction<S: Simd>(view: &View, t: Vec3s<S>) -> (Vec3s<S>, Lanes<S
     (Vec3s::new(along.x / length, along.y / length, along.z / length), length)
 }
 
-/// SH colours before the cut at zero, of the vector `at` of a block's coefficients.
+/// SH colors before the cut at zero, of the vector `at` of a block's coefficients.
 #[inline(always)]
 pub(super) fn sh_color<S: Simd>(
     degree: u32,
@@ -233,7 +230,6 @@ pub(super) fn sh_color<S: Simd>(
     color
 }
 
-/// One visible 2D splat.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Splat2d {
     pub mean: [f32; 2],
@@ -241,35 +237,33 @@ pub(super) struct Splat2d {
     pub depth: f32,
     pub color: [f32; 3],
     pub opacity: f32,
-    /// The square of the distance from its centre, in standard deviations, where alpha is
-    /// `ALPHA_MIN`.
+    /// Squared distance from the center, in standard deviations, at which alpha is `ALPHA_MIN`.
     pub reach: f32,
     pub radii: [f32; 2],
 }
 
-/// The stage's room for one block of splats: what is read and what comes out.
+/// Scratch memory for one block of splats: inputs and outputs.
 #[derive(Debug)]
 pub(super) struct ProjectBlock {
-    /// Which splats of the block are projected; what follows has them in this order.
+    /// The projected splats of the block; later arrays are in this order.
     ids: Ids,
     splats: SplatRows,
-    /// Camera-space centres.
     t: [Row; 3],
     means2d: [Row; 2],
     factors: [Row; 3],
     opacities: Row,
     reach: Row,
     radii: [Row; 2],
-    /// 1 where a splat is visible as far as its shape goes.
+    /// 1 if the splat's shape is visible.
     reaches: Row,
-    /// Places of those, in whose order is what follows: fewer, so that lanes are full.
+    /// Indices of visible splats; later arrays are compacted in this order.
     visible: Ids,
     /// Their numbers in the block.
     numbers: Ids,
     visible_t: [Row; 3],
     coeffs: ColorRows,
     colors: [Row; 3],
-    /// 1 where the colour is finite.
+    /// 1 if the color is finite.
     finite: Row,
 }
 
@@ -294,9 +288,7 @@ impl ProjectBlock {
         })
     }
 
-    /// Projects the splats `ids` of the block that begins with splat `first`, with opacities
-    /// multiplied by `compensation`, but for their colours. Returns those that are visible as far as
-    /// their shape goes, by their numbers in the block.
+    /// Projects the shapes of the splats `ids`, opacities times `compensation`; returns the visible ones.
     pub fn shapes(
         &mut self,
         view: &View,
@@ -310,13 +302,12 @@ impl ProjectBlock {
         self.numbers
     }
 
-    /// The colours of the splats that [`ProjectBlock::shapes`] returned, of a block that begins with
-    /// splat `first` of `colors`.
+    /// Computes the colors of the splats that [`ProjectBlock::shapes`] returned.
     pub fn colors(&mut self, view: &View, colors: Colors<'_, f32>, first: usize) {
         dispatch(Paint { block: self, view, colors, first });
     }
 
-    /// What came out: the visible splats with their numbers in the block, in order.
+    /// The visible splats with their ids in the block, in order.
     pub fn visible(&self) -> impl Iterator<Item = (usize, Splat2d)> {
         let places = self.visible.get().iter().enumerate();
         places.filter(|&(at, _)| self.finite.0[at] != 0.0).map(|(at, &place)| {
@@ -384,14 +375,13 @@ impl WithSimd for Paint<'_> {
 }
 
 impl ProjectBlock {
-    /// Everything but the colours.
     #[inline(always)]
     fn outline<S: Simd>(&mut self, s: S, view: &View, splats: &Splats<S>, at: usize) {
         let g = geometry(s, view, splats);
         let ellipses = ellipses(view, splats.scales, &g);
         let (zero, largest) = (Lanes::splat(s, 0.0), Lanes::splat(s, f32::MAX));
         let opacity = splats.opacity * ellipses.compensation;
-        // exp(reach / 2): the logarithm is asked for where it is positive.
+        // exp(reach / 2); its logarithm is used only if positive.
         let contrast = opacity / zero.all(ALPHA_MIN);
         let mut visible = g.drawn & contrast.gt(zero.all(1.0)) & contrast.le(largest);
         let reach = ln(contrast) * 2.0;
@@ -416,7 +406,6 @@ impl ProjectBlock {
         self.reaches.set(at, visible.keep(zero.all(1.0)));
     }
 
-    /// Colours of the visible splats.
     #[inline(always)]
     fn paint<S: Simd>(&mut self, s: S, view: &View, colors: Colors<'_, f32>, first: usize) {
         let (places, numbers) = (self.visible.get(), self.numbers);
@@ -442,8 +431,7 @@ impl ProjectBlock {
                     let (dir, _) = direction(view, get3(&self.visible_t, s, at));
                     let basis = sh::basis(degree, [dir.x, dir.y, dir.z]);
                     let color = sh_color(degree, &basis, &self.coeffs, at);
-                    // Before the cut at zero, which would hide a poisoned coefficient here and let
-                    // it out in the gradients.
+                    // Before the clamp at zero, which would hide an invalid coefficient.
                     self.finite.set(at, color.is_finite().keep(one));
                     let zero = one.all(0.0);
                     let Vec3s { x, y, z } = color;

@@ -1,5 +1,4 @@
-//! project_backward: gradients of the 2D splats to gradients of the splats and the camera, f32, a
-//! block of splats at a time, one splat per lane.
+//! project_backward in f32: a block of splats at a time, one splat per lane.
 
 use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
@@ -16,12 +15,11 @@ use crate::stages::{
     Colors, ProjectOptions, Projected, ProjectedGradients, SplatGradients, SplatParams,
 };
 
-/// Gradients of one 2D splat.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct V2d {
     pub v_mean: [f32; 2],
-    /// Gradient of the 2D covariance in the splat's own coordinates (u, v), where it is the
-    /// identity: (uu, uv, vv), uv being the one shared off-diagonal entry.
+    /// Gradient of the 2D covariance in the splat's own coordinates (u, v), in which it is the identity:
+    /// (uu, uv, vv); uv is the shared off-diagonal entry.
     pub v_whitened: [f32; 3],
     pub v_depth: f32,
     pub v_color: [f32; 3],
@@ -29,7 +27,7 @@ pub(super) struct V2d {
 }
 
 impl V2d {
-    /// The whitened covariance's gradient from that of a factor F: a small change E of the
+    /// Gradient of the whitened covariance from the gradient of a factor F: a small change E of the
     /// covariance changes F by X F with X upper triangular and X + X^T = -E.
     pub fn whitened_from_factor([p, q, r]: [f32; 3], [v_p, v_q, v_r]: [f32; 3]) -> [f32; 3] {
         [-0.5 * (p * v_p + q * v_q), -r * v_q, -0.5 * r * v_r]
@@ -68,7 +66,7 @@ impl VCamera {
     }
 }
 
-/// What each splat of a block adds to the camera's gradient.
+/// Each splat's contribution to the camera's gradient.
 #[derive(Debug)]
 struct CameraRows {
     /// Rows of the rotation.
@@ -122,7 +120,7 @@ fn sum(row: &Row, count: usize) -> f64 {
 #[inline(always)]
 fn quat_gradient<S: Simd>([w, x, y, z]: [Lanes<S>; 4], v: Mat3s<S>) -> [Lanes<S>; 4] {
     let Mat3s([vx, vy, vz]) = v;
-    // What is antisymmetric and symmetric in v.
+    // Antisymmetric and symmetric parts of v.
     let (ax, ay, az) = (vy.z - vz.y, vz.x - vx.z, vx.y - vy.x);
     let (sx, sy, sz) = (vz.y + vy.z, vx.z + vz.x, vy.x + vx.y);
     let two = w.all(2.0);
@@ -139,16 +137,16 @@ fn quat_gradient<S: Simd>([w, x, y, z]: [Lanes<S>; 4], v: Mat3s<S>) -> [Lanes<S>
 pub(super) struct Backward<'a> {
     pub view: &'a View,
     pub splats: SplatParams<'a, f32>,
-    /// What opacities are multiplied by.
+    /// Factor of the opacities.
     pub compensation: f32,
     /// Whether the camera's gradient is wanted.
     pub camera: bool,
 }
 
-/// The stage's room for one block of splats: what is read and what comes out.
+/// Scratch memory for one block of splats: inputs and outputs.
 #[derive(Debug)]
 pub(super) struct BackwardBlock {
-    /// Which splats of the block have gradients; what follows has them in this order.
+    /// The splats of the block that have gradients; later arrays are in this order.
     ids: Ids,
     splats: SplatRows,
     coeffs: ColorRows,
@@ -158,20 +156,20 @@ pub(super) struct BackwardBlock {
     v_depths: Row,
     v_colors2d: [Row; 3],
     v_opacities2d: Row,
-    // Gradients of the splats. Those of the coefficients are the basis times those of the colour.
+    // Gradients of the splats. A coefficient's is the color's times its basis function.
     v_means: [Row; 3],
     v_quats: [Row; 4],
     v_scales: [Row; 3],
     v_opacities: Row,
     basis: [Row; SH_COEFFS_MAX],
     v_colors: [Row; 3],
-    /// What the basis was evaluated at.
+    /// Directions at which the basis was evaluated.
     directions: [Row; 3],
     v_camera: CameraRows,
 }
 
-/// Gradient of a splat's colour before the cut at zero, and the direction it is seen along: the
-/// gradient of each coefficient is its basis function there times that of the colour.
+/// Gradient of a splat's color before the clamp at zero, and the viewing direction. A coefficient's
+/// gradient is its basis function at the direction times the color's gradient.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct ColorGradient {
     pub v_color: [f32; 3],
@@ -200,7 +198,6 @@ impl BackwardBlock {
         })
     }
 
-    /// Begins a block.
     #[inline(always)]
     pub fn clear(&mut self) {
         self.ids.clear();
@@ -224,13 +221,12 @@ impl BackwardBlock {
         self.v_opacities2d.0[at] = v.v_opacity;
     }
 
-    /// Writes the gradients of the splats that were pushed, colours apart, to `out`, the block's part
-    /// of the arrays, and returns the camera's. The block begins with splat `first` of `stage.splats`.
+    /// Writes the gradients of the pushed splats except colors to `out`; returns the camera's.
     pub fn run(&mut self, stage: &Backward<'_>, first: usize, out: SplatSlices<'_>) -> VCamera {
         dispatch(Run { block: self, stage, first, out })
     }
 
-    /// Gradients of the colours of the splats that were pushed, with their numbers in the block.
+    /// Gradients of the colors of the splats that were pushed, with their numbers in the block.
     pub fn color_gradients(&self) -> impl Iterator<Item = (usize, ColorGradient)> {
         let of = |rows: &[Row; 3], at: usize| [rows[0].0[at], rows[1].0[at], rows[2].0[at]];
         self.ids.get().iter().enumerate().map(move |(at, &k)| {
@@ -295,12 +291,12 @@ impl BackwardBlock {
         let (jx, jy) = (inverse_z * view.focal.x, inverse_z * view.focal.y);
         let mut v_t = none;
 
-        // Colour and, through the view direction, t and the rotation.
+        // Color and, through the view direction, t and the rotation.
         let mut v_color = get3(&self.v_colors2d, s, at);
         let mut v_along = none;
         if let Colors::Sh { degree, .. } = *colors {
             let (dir, length) = direction(view, g.t);
-            // Where nothing is drawn it may be anything, and zero times infinity is NaN.
+            // The direction is arbitrary in lanes that draw nothing, and zero times infinity is NaN.
             let dir = dir.is_finite().keep3(dir);
             set3(&mut self.directions, at, dir);
             let basis = sh::basis(degree, [dir.x, dir.y, dir.z]);
@@ -347,9 +343,9 @@ impl BackwardBlock {
         let mut v_m = [v_fm_u * p, v_fm_u.mul_add(q, v_fm_v * r)];
         if view.options.antialiased {
             // With S = M M^T and C = S + blur I, ln compensation = (ln det S - ln det C) / 2 has the
-            // gradient S^-1 M - C^-1 M, whose terms cancel for large splats; it is blur C^-1 S^-1 M.
-            // The rows of S^-1 M are m1 x n / n^2 and n x m0 / n^2 with n = m0 x m1; divided by the
-            // length twice, since its square may underflow where it does not.
+            // gradient S^-1 M - C^-1 M, whose terms cancel for large splats; it is blur C^-1 S^-1 M. The
+            // rows of S^-1 M are m1 x n / n^2 and n x m0 / n^2 with n = m0 x m1, divided by the length
+            // twice, since its square may underflow.
             let inverse_length = ellipses.area.length().recip();
             let n = ellipses.area * inverse_length * inverse_length;
             let w = [g.m[1].cross(n), n.cross(g.m[0])];
@@ -364,7 +360,7 @@ impl BackwardBlock {
         }
         let v_b = [v_m[0] * scales, v_m[1] * scales];
 
-        // Axes -> quaternion, through its normalisation.
+        // Axes -> quaternion, through its normalization.
         let v_axes = Mat3s([
             g.a[0].mul_add(v_b[0].x, g.a[1] * v_b[1].x),
             g.a[0].mul_add(v_b[0].y, g.a[1] * v_b[1].y),
@@ -380,7 +376,7 @@ impl BackwardBlock {
             v_quat[k] = g.quat[k].mul_add(-along, v_unit[k]) * g.inverse_norm;
         }
 
-        // a = J R, with x/z and y/z held where they are limited.
+        // a = J R, with clamped x/z and y/z held constant.
         let v_a = [g.axes * v_b[0], g.axes * v_b[1]];
         let (v_j02, v_j12) = (v_a[0].dot(row_z), v_a[1].dot(row_z));
         let v_jx = v_j02.mul_add(-xz, v_a[0].dot(row_x));
@@ -393,7 +389,7 @@ impl BackwardBlock {
         v_t.y = v_t.y + by_y;
         v_t.z = v_t.z - by_x.mul_add(xz, by_y * yz);
 
-        // Centre and depth.
+        // Center and depth.
         let (v_u, v_v) = (self.v_means2d[0].get(s, at), self.v_means2d[1].get(s, at));
         let (x_z, y_z) = (g.t.x * inverse_z, g.t.y * inverse_z);
         let (v_x, v_y) = (v_u * jx, v_v * jy);
@@ -401,9 +397,8 @@ impl BackwardBlock {
         v_t = v_t + Vec3s::new(v_x, v_y, v_z);
         let v_mean = to_world([row_x, row_y, row_z], v_t);
 
-        // A finite picture can still have gradients that overflow (a coefficient of 1e38, or -inf
-        // behind the cut of the colour). All of that splat's are zero then: they must not reach the
-        // camera or, through Adam's moments, later steps.
+        // A finite picture can still have gradients that overflow. All of that splat's become zero: they
+        // must not reach the camera or, through Adam's moments, later steps.
         let mut finite = Finite::new(v_opacity);
         finite.add3(v_color);
         finite.add3(v_mean);
@@ -451,7 +446,7 @@ impl BackwardBlock {
         intrinsics[3].set(at, kept.keep(v_cy));
     }
 
-    /// Writes what came out, in the parameters' layout, colours apart.
+    /// Writes the outputs except colors, in the parameters' layout.
     #[inline(always)]
     fn write(&self, ids: &[u8], out: SplatSlices<'_>) {
         for (at, &k) in (0..BLOCK).zip(ids) {

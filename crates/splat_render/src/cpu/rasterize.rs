@@ -1,4 +1,4 @@
-//! rasterize: ids to colour, alpha, depth and final transmittance, a tile at a time.
+//! rasterize: ids to color, alpha, depth and final transmittance, a tile at a time.
 
 use std::sync::atomic::AtomicU32;
 
@@ -50,7 +50,6 @@ impl Planes {
 /// A tile's rows in each plane.
 type Rows<'a> = [[&'a mut [f32]; SIDE]; 5];
 
-/// Cuts a row of tiles into its tiles.
 fn tiles(band: [&mut [f32]; 5], width: usize) -> Vec<Rows<'_>> {
     let mut tiles: Vec<Rows<'_>> = Vec::new();
     tiles.resize_with(width.div_ceil(SIDE), Rows::default);
@@ -142,8 +141,7 @@ fn blend<S: Simd, const DEPTH: bool>(
     }
 }
 
-/// Renders every tile into `out`, which must have the picture's size; the depth plane is zero
-/// without `DEPTH`, which a fit does not look at.
+/// Renders every tile into `out`, of the picture's size; the depth plane is zero without `DEPTH`.
 pub(super) fn rasterize_tiles<const DEPTH: bool>(
     splats: &[TileSplat],
     bins: &Bins,
@@ -152,8 +150,7 @@ pub(super) fn rasterize_tiles<const DEPTH: bool>(
 ) {
     let width = out.width;
     let columns = width.div_ceil(SIDE);
-    // Tasks are tiles: rows of tiles are too few for many threads and hold very different numbers of
-    // pairs.
+    // One task per tile: rows of tiles are too few and too uneven for many threads.
     out.bands().enumerate().for_each(|(tile_row, band)| {
         let rows = band[0].len() / width;
         tiles(band, width).into_par_iter().enumerate().for_each(|(column, out)| {

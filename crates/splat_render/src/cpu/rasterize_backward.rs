@@ -1,5 +1,4 @@
-//! rasterize_backward: image gradients to per-splat 2D gradients, front to back, so that it rounds
-//! and stops exactly as the forward pass did.
+//! rasterize_backward: front to back, so that it rounds and stops exactly as the forward pass.
 
 use std::sync::atomic::AtomicU32;
 
@@ -28,16 +27,14 @@ pub(super) const DEPTH_SUMS: usize = 10;
 /// Sums with depth and absolute gradients.
 pub(super) const ABSOLUTE_SUMS: usize = 12;
 
-/// What a picture's gradients are taken of and with respect to.
+/// A picture and the gradients of the loss with respect to it.
 #[derive(Clone, Copy)]
 pub(super) struct PictureGradients<'a> {
     /// The forward pass's picture, over its background.
     pub image: &'a Planes,
-    /// Gradient of each colour channel, H x W.
+    /// Gradient of each color channel, H x W.
     pub v_color: &'a [Vec<f32>; 3],
-    /// Gradient of alpha, if there is one.
     pub v_alpha: Option<&'a [f32]>,
-    /// Gradient of the accumulated depth, if there is one.
     pub v_depth: Option<&'a [f32]>,
 }
 
@@ -59,7 +56,7 @@ impl<const N: usize> WithSimd for Tile<'_, N> {
     fn with_simd<S: Simd>(self, s: S) {
         let zeros = Pixels([0.0; PIXELS]);
         let PictureGradients { image, v_color, v_alpha, v_depth } = self.picture;
-        // What lies behind the splats seen so far, dotted with the gradients.
+        // Color behind the splats so far, dotted with the gradients.
         let mut behind = zeros;
         if let Some(v_alpha) = v_alpha {
             let t = self.place.load::<S>(&image.planes[4]);
@@ -135,7 +132,7 @@ impl<const N: usize> WithSimd for Tile<'_, N> {
                     }
                     let rest = s.negate_mul_add_e_f32s(weight, own, behind[at]);
                     behind[at] = rest;
-                    // v_alpha * gaussian, zero where the cap holds alpha or nothing is added.
+                    // v_alpha * gaussian, zero if the cap holds alpha or nothing is added.
                     let inverse = s.div_f32s(one, through);
                     let v_alpha = s.negate_mul_add_e_f32s(rest, inverse, s.mul_f32s(before, own));
                     let free = s.less_than_or_equal_f32s(uncapped, s.splat_f32s(ALPHA_MAX));
@@ -184,8 +181,7 @@ pub(super) fn rasterize_backward_tiles<const N: usize>(
     let columns = width.div_ceil(SIDE);
     sums.resize(bins.splats.len(), [0.0; N]);
 
-    // Tasks are tiles, each with the part of `sums` that is its own: rows of tiles are too few for
-    // many threads and hold very different numbers of pairs.
+    // One task per tile: rows of tiles are too few and too uneven for many threads.
     let mut tiles = Vec::with_capacity(bins.starts.len());
     let mut rest = sums.as_mut_slice();
     for tile in 0..bins.starts.len() - 1 {
@@ -213,8 +209,7 @@ pub(super) fn rasterize_backward_tiles<const N: usize>(
     });
 }
 
-/// Adds up a splat's pairs, at these positions in tile order, and turns whitened moments into 2D
-/// gradients, with the absolute gradient of the centre where `N` has it.
+/// Sums a splat's pairs and converts whitened moments to 2D gradients (see `N`).
 #[inline(always)]
 pub(super) fn gather<const N: usize>(
     splat: &TileSplat,
@@ -246,7 +241,7 @@ pub(super) fn gather<const N: usize>(
     (v, v_mean_absolute)
 }
 
-/// Gradients of all 2D splats, each with the absolute one of its centre where `N` has it.
+/// Gradients of all 2D splats, with the centers' absolute gradients if `N` includes them.
 fn gradients<const N: usize>(
     Binned { splats, bins }: &Binned,
     picture: PictureGradients<'_>,

@@ -1,8 +1,7 @@
 //! Vector helpers on top of `pulp`, which picks the instruction set at run time.
 //!
-//! Code that runs inside `with_simd` must use plain loops where vectors are touched: a closure, and
-//! so `array::map` or `fold`, is compiled without the instruction set and turns every vector
-//! operation into a call.
+//! Code inside `with_simd` must use plain loops for vector operations: a closure, and so `array::map` or
+//! `fold`, is compiled without the instruction set and turns every vector operation into a call.
 
 use pulp::{Simd, WithSimd};
 
@@ -43,7 +42,7 @@ pub fn instruction_set() -> &'static str {
     }
 }
 
-/// Asks for a value of up to 64 bytes ahead of its use, where Rust has an instruction for it.
+/// Prefetches a value of up to 64 bytes if Rust has an instruction for it.
 #[inline(always)]
 pub(super) fn prefetch<T>(value: &T) {
     #[cfg(target_arch = "x86_64")]
@@ -62,8 +61,7 @@ pub(super) fn prefetch<T>(value: &T) {
     let _ = value;
 }
 
-/// 2^-d for d >= 0, relative error below 1.2e-7 (1.4e-8 of the polynomial, the rest rounding).
-/// Above 126 it returns about 2^-126.
+/// 2^-d for d >= 0, relative error below 1.2e-7; about 2^-126 above 126.
 #[inline(always)]
 pub fn exp2_of_minus<S: Simd>(s: S, d: S::f32s) -> S::f32s {
     // Adding 1.5 * 2^23 leaves the nearest integer in the low mantissa bits.
@@ -109,14 +107,12 @@ mod tests {
     };
 
     thread_local! {
-        /// Lanes to run with in place of the machine's own, 0 for those. Each thread has its own:
-        /// other tests run at the same time.
+        /// Overrides the number of lanes in a thread; 0 for the machine's.
         pub static LANES: Cell<usize> = const { Cell::new(0) };
     }
 
     type Results = (Image<f32>, ProjectedGradients<f32>, Vec<f32>);
 
-    /// What `work` gives at this many lanes.
     fn at<T: Send>(lanes: usize, work: impl FnOnce() -> T + Send) -> T {
         rayon::ThreadPoolBuilder::new()
             .num_threads(2)
@@ -141,17 +137,9 @@ mod tests {
         let v = Cpu.rasterize_backward(splats, [0.1, 0.2, 0.3], &image, &v_image, true).unwrap();
         let [r, g, b]: [Vec<f32>; 3] =
             std::array::from_fn(|c| image.color.iter().map(|color| color[c]).collect());
-        let photo = Target {
-            width: splats.width,
-            height: splats.height,
-            channels: 3,
-            pixels: image.color.as_flattened().iter().map(|v| (255.0 * (1.0 - v)) as u8).collect(),
-            weights: Some(r.clone()),
-            depth: None,
-            background: None,
-            turns: 1,
-            until: None,
-        };
+        let pixels = image.color.as_flattened().iter().map(|v| (255.0 * (1.0 - v)) as u8);
+        let photo = Target::new(splats.width, splats.height, 3, pixels.collect());
+        let photo = Target { weights: Some(r.clone()), ..photo };
         let mut loss = Loss::default();
         let mut out = vec![loss.run([&r, &g, &b], &photo, [0.0; 3], 0.2)];
         out.extend(loss.v_color.iter().flatten());
@@ -169,8 +157,7 @@ mod tests {
         most / largest
     }
 
-    /// Machines with other vectors than this one's must draw the same: 16 lanes as AVX-512 has, 8 as
-    /// AVX2, 4 as NEON, 1 as where there are none, computed here without their instructions.
+    /// All vector widths must draw the same: 16 (AVX-512), 8 (AVX2), 4 (NEON) and 1 lanes.
     #[test]
     fn every_vector_width_draws_the_same() {
         let mut rng = rand_pcg::Pcg64::seed_from_u64(6);
@@ -196,7 +183,7 @@ mod tests {
                 let color =
                     apart(image_n.color.as_flattened().iter(), image.color.iter().flatten());
                 assert!(color < 1e-6, "{what}: picture {color:e}");
-                // Not the same bits: where there are no instructions, multiply-adds round twice.
+                // Not the same bits: without fused instructions, multiply-adds round twice.
                 let t = apart(image_n.transmittance.iter(), image.transmittance.iter());
                 assert!(t < 1e-6, "{what}: transmittance {t:e}");
                 let pairs = [
@@ -215,7 +202,7 @@ mod tests {
         }
     }
 
-    /// 2D splats, gradients of the splats and where a step of Adam takes them.
+    /// 2D splats, gradients of the splats, and parameters after a step of Adam.
     fn per_splat(
         splats: &SplatArrays,
         options: &ProjectOptions,
@@ -292,7 +279,7 @@ mod tests {
                     let moved = |a: &AdamState<f32>, splats: &SplatArrays| -> Vec<f32> {
                         let rows = a.splats.means.as_flattened().iter();
                         let rows = rows.zip(splats.means.as_flattened());
-                        // Only what was no number before may be none.
+                        // A result may be NaN only if the input was.
                         rows.filter(|(_, b)| b.is_finite()).map(|(a, b)| a - b).collect()
                     };
                     let viewmat = |v: &SplatGradients<f32>| -> Vec<f32> {

@@ -1,10 +1,9 @@
-//! The SSIM window as two passes of 11 taps, and how a picture's rows lie in memory for them.
+//! The SSIM window as two passes of 11 taps, and the memory layout of a picture's rows for them.
 //!
-//! A row is cut into as many equal parts as a vector has lanes, and vector k holds the k-th value of
-//! each part. So the neighbours of a vector's values along the row are the vectors beside it: both
-//! passes read whole, aligned vectors, where a row as it lies in the picture would be read across
-//! cache lines, once for each tap. Only where a part begins or ends do values come from the next
-//! lane.
+//! A row is cut into as many equal parts as a vector has lanes; vector k holds the k-th value of each
+//! part. The neighbors of a vector's values along the row are then in the adjacent vectors, and both
+//! passes read whole, aligned vectors. In row-major layout each tap would read across cache lines. Only
+//! at the ends of parts do values come from the next lane.
 
 use bytemuck::{Pod, Zeroable};
 use glam::{Mat4, Vec4};
@@ -12,16 +11,15 @@ use pulp::Simd;
 
 use crate::constants::SSIM_WINDOW;
 
-/// Taps on each side of the window's centre.
+/// Taps on each side of the window's center.
 pub(super) const HALF: usize = SSIM_WINDOW.len() / 2;
-/// Neighbouring results that are computed side by side, since they share most of what they read.
+/// Neighboring results computed together, since they share most of their inputs.
 pub(super) const STEP: usize = 4;
-/// Values that so many results are made of.
+/// Number of inputs of [`STEP`] neighboring results.
 pub(super) const REACH: usize = STEP + 2 * HALF;
 /// Rows that a ring keeps: at least [`REACH`], a multiple of [`STEP`], and a power of two.
 pub(super) const SLOTS: usize = 16;
-/// Side of the blocks in which a row's values are put into another order, as a [`Mat4`], which has
-/// instructions for it.
+/// Side of the blocks in which rows are transposed, as a [`Mat4`].
 const BLOCK: usize = 4;
 /// Floats of the widest vectors.
 const WIDEST: usize = 16;
@@ -35,7 +33,6 @@ struct CacheLine([f32; WIDEST]);
 pub(super) struct Aligned(Vec<CacheLine>);
 
 impl Aligned {
-    /// So many vectors, whatever they hold.
     pub fn vectors<S: Simd>(&mut self, count: usize) -> &mut [S::f32s] {
         let lines = (count * S::F32_LANES).div_ceil(WIDEST);
         if self.0.len() < lines {
@@ -45,14 +42,13 @@ impl Aligned {
     }
 }
 
-/// Vectors of a row: at least as many as the window reaches into a part from the next one.
+/// Vectors of a row: at least [`HALF`], so that a window spans at most two parts.
 #[inline(always)]
 pub(super) fn vectors_of_row<S: Simd>(width: usize) -> usize {
     width.div_ceil(S::F32_LANES).max(HALF)
 }
 
-/// Spreads a row that lies as in a picture, a whole number of vectors, over the parts: the vectors
-/// are `stride` floats apart in `to`.
+/// Spreads a row in picture order over the parts; vectors are `stride` floats apart in `to`.
 #[inline(always)]
 pub(super) fn spread<S: Simd>(row: &[f32], to: &mut [f32], stride: usize) {
     let vectors = row.len() / S::F32_LANES;
@@ -105,14 +101,13 @@ pub(super) fn collect<S: Simd>(from: &[f32], row: &mut [f32]) {
     }
 }
 
-/// Where blocks begin that cover so many vectors; the last one may overlap the one before it.
+/// Starts of the blocks that cover `vectors` vectors; the last may overlap the one before it.
 #[inline(always)]
 fn blocks(vectors: usize) -> impl Iterator<Item = usize> {
     (0..vectors.div_ceil(BLOCK)).map(move |block| (block * BLOCK).min(vectors - BLOCK))
 }
 
-/// Fills the [`HALF`] vectors before and after those of a row with the neighbouring parts' values,
-/// zero beyond the picture.
+/// Fills the padding of a row with the neighboring parts' values, zero beyond the picture.
 #[inline(always)]
 pub(super) fn fill_ends<S: Simd>(s: S, row: &mut [S::f32s]) {
     const INDEX: [f32; WIDEST] = {
@@ -129,7 +124,7 @@ pub(super) fn fill_ends<S: Simd>(s: S, row: &mut [S::f32s]) {
     let not_first = s.greater_than_f32s(index, s.splat_f32s(0.5));
     let not_last = s.less_than_f32s(index, s.splat_f32s(lanes as f32 - 1.5));
     for k in 0..HALF {
-        // One float further left or right is one lane on, but for the lane that has none beside it.
+        // Shifting by one float moves to the next lane, except in the lane at the end.
         let values = bytemuck::cast_slice::<S::f32s, f32>(row);
         let before = load::<S>(values, (vectors + k) * lanes - 1);
         let after = load::<S>(values, (HALF + k) * lanes + 1);
@@ -154,7 +149,7 @@ pub(super) fn many_registers<S: Simd>() -> bool {
     S::REGISTER_COUNT >= 32
 }
 
-/// [`STEP`] neighbouring results of a pass.
+/// [`STEP`] neighboring results of a pass.
 #[inline(always)]
 pub(super) fn filter_step<S: Simd>(s: S, values: &[S::f32s; REACH]) -> [S::f32s; STEP] {
     if many_registers::<S>() {
@@ -165,7 +160,7 @@ pub(super) fn filter_step<S: Simd>(s: S, values: &[S::f32s; REACH]) -> [S::f32s;
     [a, b, c, d]
 }
 
-/// `N` neighbouring results of a pass from their N + 2 [`HALF`] values.
+/// `N` neighboring results of a pass from their N + 2 [`HALF`] values.
 #[inline(always)]
 pub(super) fn filter<S: Simd, const N: usize>(s: S, values: &[S::f32s]) -> [S::f32s; N] {
     let values = &values[..N + 2 * HALF];

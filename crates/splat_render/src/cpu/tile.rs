@@ -1,5 +1,5 @@
-//! A tile as the inner loops of rasterize and rasterize_backward see it: how its pixels lie in
-//! memory, what they read of a splat, and which of its vectors a splat reaches.
+//! A tile in the inner loops of rasterize and rasterize_backward: the memory layout of its pixels, the
+//! data of its splats, and the vectors of pixels that a splat reaches.
 
 use std::cell::RefCell;
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
@@ -14,8 +14,7 @@ use crate::constants::TILE;
 pub(super) const SIDE: usize = TILE as usize;
 pub(super) const PIXELS: usize = SIDE * SIDE;
 
-/// Splats that are looked up together, and between two looks at which of a tile's vectors still take
-/// light.
+/// Splats per batch; after each batch, stopped vectors are dropped.
 pub(super) const BATCH: usize = 16;
 
 /// sqrt(log2(e) / 2): scales a factor so that exp(-sigma) = 2^-(u^2 + v^2).
@@ -33,19 +32,17 @@ const fn block_width(lanes: usize) -> usize {
     if lanes < 4 { 1 } else { 4 }
 }
 
-/// Rows of a block.
 #[inline(always)]
 const fn block_height(lanes: usize) -> usize {
     lanes / block_width(lanes)
 }
 
-/// Blocks side by side in a tile.
 #[inline(always)]
 const fn blocks_across(lanes: usize) -> usize {
     SIDE / block_width(lanes)
 }
 
-/// Where a tile lies in a plane, row-major, of a picture.
+/// Position of a tile in a row-major plane.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Place {
     /// Index of its first pixel.
@@ -81,8 +78,7 @@ impl Place {
 }
 
 impl Pixels {
-    /// Transmittance before the first splat: 1, and negative, as if stopped, beyond the rows and
-    /// columns that the picture has.
+    /// Initial transmittance: 1, and negative (stopped) outside the picture.
     #[inline(always)]
     pub fn clear(rows: usize, columns: usize, lanes: usize) -> Self {
         let mut pixels = Self([1.0; PIXELS]);
@@ -114,7 +110,7 @@ impl Pixels {
     }
 }
 
-/// Where the pixel of a tile's row and column lies in [`Pixels`].
+/// Index of a tile's pixel in [`Pixels`].
 #[inline(always)]
 fn offset(row: usize, column: usize, lanes: usize) -> usize {
     let (width, height) = (block_width(lanes), block_height(lanes));
@@ -122,19 +118,18 @@ fn offset(row: usize, column: usize, lanes: usize) -> usize {
     block * lanes + row % height * width + column % width
 }
 
-/// Where a tile's pixels are in the picture.
+/// Pixel centers of a tile.
 #[repr(align(64))]
 pub(super) struct Centers {
-    /// x of the pixel centres of each block of a row of blocks.
+    /// x of the pixel centers of each block of a row of blocks.
     x: [f32; 4 * WIDEST],
-    /// y of the pixel centres of each block of a column of blocks.
+    /// y of the pixel centers of each block of a column of blocks.
     y: [f32; 4 * WIDEST],
-    /// y of the rows' pixel centres.
+    /// y of the rows' pixel centers.
     rows: [f32; SIDE],
-    /// For each block of a row of blocks, the bits in [`Vectors`] of those blocks below it that hold
-    /// the rows of a vector's lanes.
+    /// For each block of the top row, the bits in [`Vectors`] of the blocks below it.
     bits: [u32; 4 * WIDEST],
-    /// x of the first pixel centre.
+    /// x of the first pixel center.
     left: f32,
 }
 
@@ -197,18 +192,15 @@ impl TileSplat {
     }
 }
 
-/// A bit per vector of a tile, in the order of [`Pixels`]: vector k is bit k % 64 of word k / 64.
-/// More than one word only where there are no vectors of four lanes.
+/// One bit per vector of a tile, in the order of [`Pixels`]; one word for at least four lanes.
 pub(super) type Vectors = [u64; PIXELS / 64];
 
-/// Where the splats of a batch may be seen in a tile: the first half of both rasterize stages. What
-/// depends on no pixel's state is found for the whole batch, in short loops on purpose: no processor
-/// looks far enough ahead to do it while a pixel waits for the splat before.
+/// Pixels of a tile that a batch of splats may reach: the first half of both rasterize stages, in short
+/// loops over the batch, since it does not depend on the pixels' state.
 pub(super) struct Reached {
-    /// Copies of the splats, since they lie anywhere in memory: asked for together, they are waited
-    /// for once.
+    /// Copies of the splats, fetched together because they are scattered in memory.
     pub splats: [TileSplat; BATCH],
-    /// Each splat's vectors end here in what follows.
+    /// Each splat's end in the arrays of vectors.
     pub ends: [usize; BATCH],
     /// Numbers of the vectors that splats may reach and whose pixels have not all stopped.
     pub vectors: [u8; BATCH * PIXELS],
@@ -243,8 +235,7 @@ impl Reached {
         })
     }
 
-    /// Takes the next splats of a tile's list and finds their vectors, of those in `live`; returns
-    /// how many splats there were.
+    /// Finds the vectors of the next splats within `live`; returns the number of splats.
     #[inline(always)]
     pub fn find<S: Simd, const OFFSETS: bool>(
         &mut self,
@@ -258,7 +249,7 @@ impl Reached {
         for (copy, id) in self.splats.iter_mut().zip(ids) {
             *copy = splats[id.load(Relaxed) as usize];
         }
-        // Those of the next batch are on their way while this one is looked at.
+        // Prefetch the next batch.
         for id in ids.iter().skip(BATCH).take(BATCH) {
             prefetch(&splats[id.load(Relaxed) as usize]);
         }
@@ -283,7 +274,7 @@ impl Reached {
         taken
     }
 
-    /// Fills in what the first `count` vectors hold.
+    /// Evaluates the first `count` vectors.
     #[inline(always)]
     fn evaluate<S: Simd, const OFFSETS: bool>(&mut self, s: S, centers: &Centers, count: usize) {
         let across = blocks_across(S::F32_LANES);
@@ -307,7 +298,7 @@ impl Reached {
     }
 }
 
-/// The values of a batch's vectors, one after the other.
+/// The values of a batch's vectors, contiguous.
 #[inline(always)]
 pub(super) fn floats(pixels: &[Pixels; BATCH]) -> &[f32] {
     bytemuck::cast_slice(pixels)
@@ -351,8 +342,7 @@ fn reach<S: Simd>(s: S, splat: &TileSplat, centers: &Centers) -> Vectors {
     reached
 }
 
-/// Sets the bits of the vectors in which some pixel has not stopped (transmittance above zero);
-/// false if there is none.
+/// Marks the vectors with a pixel that has not stopped; false if there is none.
 #[inline(always)]
 pub(super) fn live_vectors<S: Simd>(s: S, t: &[S::f32s], live: &mut Vectors) -> bool {
     let zero = s.splat_f32s(0.0);

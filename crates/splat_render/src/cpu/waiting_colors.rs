@@ -1,6 +1,5 @@
-//! Colours that wait: a step leaves a splat's colours as they are and keeps their gradient, and when the
-//! splat is next projected, that step and all that followed without a gradient are done in one go. So
-//! colours and moments of splats out of sight are neither read nor written; see `fit_device::waiting`.
+//! Colors that wait: a step keeps a splat's color gradient, and all waiting steps are done in one go when
+//! the splat is next projected (see `fit_device::waiting`). This saves memory traffic for unseen splats.
 
 use pulp::{Simd, WithSimd};
 
@@ -13,7 +12,7 @@ use crate::constants::SH_COEFFS_MAX;
 use crate::fit_device::ColorStep;
 use crate::sh;
 
-/// How far a splat's colours are.
+/// How far a splat's colors are.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct WaitingColor {
     /// The first of the steps that they wait for.
@@ -24,17 +23,17 @@ pub(super) struct WaitingColor {
 }
 
 impl WaitingColor {
-    /// Takes the gradient of the step at hand; the colours are up to date but for it.
+    /// Takes the gradient of the step at hand; the colors are up to date but for it.
     pub fn add(&mut self, gradient: ColorGradient) {
         (self.has_gradient, self.gradient) = (true, gradient);
     }
 }
 
-/// The steps that colours wait for, as every block of splats takes them.
+/// The steps that colors wait for, as every block of splats takes them.
 pub(super) struct ColorPlan<'a> {
     steps: &'a [ColorStep],
     degree: u32,
-    /// Floats of colour per splat: stored, and of the degree in use.
+    /// Floats of color per splat: stored, and of the degree in use.
     stored: usize,
     used: usize,
     /// 1 for each float of a block that has the first coefficient's rate.
@@ -54,7 +53,7 @@ impl<'a> ColorPlan<'a> {
 /// Room for one block of splats.
 #[derive(Debug)]
 pub(super) struct ColorBlock {
-    /// Splats that wait; what follows has them in this order.
+    /// The splats that wait; later arrays are in this order.
     ids: Ids,
     v_colors: [Row; 3],
     directions: [Row; 3],
@@ -74,8 +73,7 @@ impl ColorBlock {
         })
     }
 
-    /// Does all steps that the splats `ids` of a block wait for. `arrays` are its colours with their
-    /// first and second moments.
+    /// Does all waiting steps of the splats `ids`; `arrays` are colors, first and second moments.
     pub fn run(
         &mut self,
         plan: &ColorPlan<'_>,
@@ -106,7 +104,7 @@ impl ColorBlock {
         }
     }
 
-    /// Gradients of the coefficients of the splats that wait; zeros where a splat has none.
+    /// Gradients of the coefficients of waiting splats; zeros for splats without a gradient.
     #[inline(always)]
     fn expand<S: Simd>(&mut self, s: S, plan: &ColorPlan<'_>, waiting: &[WaitingColor]) {
         let ids = self.ids;
@@ -160,7 +158,7 @@ impl WithSimd for CatchUp<'_, '_> {
         let ids = ids.get();
         let mut at = 0;
         while at < ids.len() {
-            // Neighbours that wait for the same steps go together, where no coefficient rests.
+            // Neighbors that wait for the same steps are updated together if all coefficients are in use.
             let (id, next) = (usize::from(ids[at]), waiting[usize::from(ids[at])].next);
             let mut count = 1;
             while plan.used == plan.stored
@@ -184,7 +182,7 @@ impl WithSimd for CatchUp<'_, '_> {
     }
 }
 
-/// Adam's steps on values and their moments: the first with a gradient, the others without.
+/// Runs Adam's steps on values and their moments: the first with a gradient, the rest without.
 #[inline(always)]
 fn steps<S: Simd>(
     s: S,

@@ -5,7 +5,7 @@ use crate::constants::SH_DEGREE_MAX;
 use crate::error::{Error, Result};
 use crate::stages::Rates;
 
-/// MCMC's noise on the centres, in units of 3DGS's rate (the paper's).
+/// MCMC's noise on the centers, in units of 3DGS's rate (the paper's).
 const MCMC_NOISE: f32 = 5e5;
 
 /// How the number of splats is controlled.
@@ -17,25 +17,25 @@ pub enum DensityControl {
     /// Clone, split and prune (Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field
     /// Rendering", 2023).
     Original,
-    /// The splats given stay as many as they are.
+    /// The number of splats stays constant.
     Fixed,
 }
 
 /// Background of renders and of photos with alpha.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Background {
-    /// A new colour in every step for photos with alpha; black for photos without.
+    /// A new color in every step for photos with alpha; black for photos without.
     Random,
-    /// One colour, RGB in 0..1.
+    /// One color, RGB in 0..1.
     Color([f32; 3]),
 }
 
-/// Settings of a fit. Rates are those of 3DGS unless said otherwise.
+/// Settings of a fit. Rates default to 3DGS's.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FitConfig {
-    /// Number of steps of the whole fit; the centres' rate decays over it.
+    /// Number of steps of the whole fit; the centers' rate decays over it.
     pub steps: u32,
-    /// The step that moments began at, above 0 where a fit enters the schedule with splats of another.
+    /// The step at which moments start; above 0 if a fit enters the schedule with other splats.
     pub first_step: u32,
     /// Seed of everything random.
     pub seed: u64,
@@ -43,7 +43,7 @@ pub struct FitConfig {
     pub sh_degree: u32,
     /// Steps after which the degree in use grows by one; at most a fifth of all steps.
     pub sh_interval: u32,
-    /// Most splats there may be.
+    /// Maximum number of splats.
     pub max_splats: usize,
     /// How splats are added and removed.
     pub density: DensityControl,
@@ -51,28 +51,22 @@ pub struct FitConfig {
     pub background: Background,
     /// Weight of D-SSIM in the loss.
     pub ssim_weight: f32,
-    /// Adam's rates at the end; that of the centres before `means_decay`, in units of the scene's
-    /// extent.
+    /// Adam's final rates; for the centers the rate before `means_decay`, in units of the scene's extent.
     pub rates: Rates,
-    /// What the first half of the steps multiplies all rates by; the factor then falls to 1, but for
-    /// the centres, whose rate decays by itself. See [`FitConfig::rates_at`].
+    /// Learning-rate multiplier for the first half of the steps; decays to 1, except for the centers,
+    /// whose rate has its own decay. See [`FitConfig::rates_at`].
     pub rate_scale: f32,
-    /// Part of the splats that a step leaves out at random, growing from none in the first step to
-    /// this in the last (DropGaussian).
+    /// Final fraction of dropped splats; grows linearly from 0 (DropGaussian).
     pub dropout: f32,
-    /// Whether splats outside the visual hull of photos with alpha are removed.
-    pub hull: bool,
     /// How cameras are fitted, or None: they are taken as exact.
     pub cameras: Option<CameraConfig>,
     /// Whether a gain and an offset per channel of each photo are fitted; see [`super::Exposures`].
     pub exposures: bool,
-    /// Whether the first steps are on photos of a fraction of their size; see
-    /// [`FitConfig::reduction`].
+    /// Whether the first steps use reduced photos; see [`FitConfig::reduction`].
     pub coarse_to_fine: bool,
-    /// What the loss of photos' depths is multiplied by in the first step; see
-    /// [`FitConfig::depth_weight_at`].
+    /// Initial weight of the depth loss; see [`FitConfig::depth_weight_at`].
     pub depth_weight: f32,
-    /// What the centres' rate has decayed to at the end, as a part of the start's.
+    /// Final rate of the centers as a fraction of the initial rate.
     pub means_decay: f32,
 }
 
@@ -98,7 +92,6 @@ impl Default for FitConfig {
             },
             rate_scale: 1.0,
             dropout: 0.0,
-            hull: false,
             cameras: None,
             exposures: false,
             coarse_to_fine: false,
@@ -115,20 +108,16 @@ const MOST_HALVINGS: u32 = 3;
 /// Part of the steps after which photos have their whole size.
 const COARSE_UNTIL: f64 = 0.3;
 
-/// What the weight of photos' depths falls to, as a part of the first step's.
+/// Final weight of the depth loss as a fraction of the initial weight.
 const DEPTH_DECAY: f64 = 0.01;
 
 /// Steps until density control first runs, and from one run to the next, at most.
 const REFINE: (u32, u32) = (300, 100);
 
 impl FitConfig {
-    /// What both sides of photos are divided by in a step, from 0: a power of two, each for as many
-    /// steps as the next, and 1 in the last seven tenths of all steps.
-    ///
-    /// A step costs what its pixels and splats cost, and while there are few splats, they show no
-    /// detail of the photos (Chen et al., "DashGaussian", 2025, section 3.2).
-    ///
-    /// `longest` is the longest side of all photos, in pixels.
+    /// Factor by which a step (from 0) reduces both sides of photos: a power of two; 1 from 30 % of the
+    /// steps on. Fewer pixels are faster, and few splats show no detail (Chen et al., "DashGaussian",
+    /// 2025, section 3.2). `longest` is the longest side of all photos, in pixels.
     pub fn reduction(&self, step: u32, longest: u32) -> u32 {
         let halvings = (longest / COARSE_SIDE).checked_ilog2().unwrap_or(0).min(MOST_HALVINGS);
         let progress = f64::from(step) / f64::from(self.steps);
@@ -139,10 +128,8 @@ impl FitConfig {
         1 << halvings.saturating_sub(done)
     }
 
-    /// Adam's rates in a step, from 0, of a scene of this extent.
-    ///
-    /// 3DGS's rates are for 30 000 steps. In a fit of a tenth of these, splats do not get to where
-    /// they belong: larger steps take them there, and small ones at the end settle them.
+    /// Adam's rates at a step (from 0) for a scene of this extent. 3DGS's rates are for 30 000 steps;
+    /// shorter fits need larger steps first and small ones at the end.
     pub fn rates_at(&self, step: u32, extent: f32) -> Rates {
         let progress = f64::from(step) / f64::from(self.steps);
         let decay = f64::from(self.means_decay).powf(progress) as f32;
@@ -159,10 +146,8 @@ impl FitConfig {
         }
     }
 
-    /// Size of MCMC's noise on centres in a step, from 0, of a scene of this extent; 0 elsewhere.
-    ///
-    /// It is in units of 3DGS's rate, not of the rate in use: noise explores, and where centres
-    /// take larger steps, as large noise leaves them beside what they show.
+    /// Size of MCMC's noise on centers at a step (from 0) for a scene of this extent; 0 for other
+    /// controls. In units of 3DGS's rate: larger noise would leave centers off their surfaces.
     pub(super) fn noise_at(&self, step: u32, extent: f32) -> f32 {
         match self.density {
             DensityControl::Mcmc => {
@@ -172,9 +157,8 @@ impl FitConfig {
         }
     }
 
-    /// What the loss of photos' depths is multiplied by in a step, from 0: it falls to a hundredth,
-    /// each step by the same factor. Depths say where to begin, and are less exact than photos
-    /// (Kerbl et al., "A Hierarchical 3D Gaussian Representation", 2024).
+    /// Weight of the depth loss at a step (from 0); decays exponentially to a hundredth (Kerbl et al., "A
+    /// Hierarchical 3D Gaussian Representation", 2024).
     pub fn depth_weight_at(&self, step: u32) -> f32 {
         let progress = f64::from(step) / f64::from(self.steps);
         self.depth_weight * DEPTH_DECAY.powf(progress) as f32
@@ -189,9 +173,8 @@ impl FitConfig {
         (step / interval).min(self.sh_degree)
     }
 
-    /// The step that density control first runs after, and how many lie between two runs: those of
-    /// 3DGS, but short fits are looked at as often as long ones, as long as photos have their turns
-    /// in between.
+    /// First step of density control, and the interval between runs: 3DGS's, but short fits get the same
+    /// number of runs as long ones if every photo has its turn in between.
     pub fn refine_steps(&self) -> (u32, u32) {
         let (start, every) = REFINE;
         ((self.steps / 10).clamp(start / 4, start), (self.steps / 30).clamp(every / 4, every))
@@ -208,17 +191,17 @@ impl FitConfig {
         if self.sh_degree > SH_DEGREE_MAX {
             return Err(Error::argument(
                 "sh_degree",
-                format!("must lie in 0..={SH_DEGREE_MAX}, got {}", self.sh_degree),
+                format!("must be in 0..={SH_DEGREE_MAX}, got {}", self.sh_degree),
             ));
         }
         if self.sh_interval == 0 {
             return Err(Error::argument("sh_interval", "must be at least 1"));
         }
         if self.max_splats == 0 || self.max_splats > 1 << 27 {
-            return Err(Error::argument("max_splats", "must lie in 1..=134217728"));
+            return Err(Error::argument("max_splats", "must be in 1..=134217728"));
         }
         if !(0.0..=1.0).contains(&self.ssim_weight) {
-            return Err(Error::argument("ssim_weight", "must lie in 0..=1"));
+            return Err(Error::argument("ssim_weight", "must be in 0..=1"));
         }
         let Rates { means, quats, scales, opacities, sh0, sh_rest } = self.rates;
         let rates = [means, quats, scales, opacities, sh0, sh_rest];
@@ -229,10 +212,10 @@ impl FitConfig {
             return Err(Error::argument("rate_scale", "must be finite and above 0"));
         }
         if !(0.0..=0.9).contains(&self.dropout) {
-            return Err(Error::argument("dropout", "must lie in 0..=0.9"));
+            return Err(Error::argument("dropout", "must be in 0..=0.9"));
         }
         if !(self.means_decay > 0.0 && self.means_decay <= 1.0) {
-            return Err(Error::argument("means_decay", "must lie above 0 and at most at 1"));
+            return Err(Error::argument("means_decay", "must be above 0 and at most 1"));
         }
         if !(self.depth_weight.is_finite() && self.depth_weight >= 0.0) {
             return Err(Error::argument("depth_weight", "must be finite and not negative"));
@@ -243,7 +226,7 @@ impl FitConfig {
         if let Background::Color(color) = self.background
             && !color.iter().all(|c| (0.0..=1.0).contains(c))
         {
-            return Err(Error::argument("background", "must lie in 0..=1"));
+            return Err(Error::argument("background", "must be in 0..=1"));
         }
         Ok(())
     }
@@ -281,7 +264,7 @@ mod tests {
     }
 
     #[test]
-    fn short_fits_are_looked_at_as_often_as_long_ones() {
+    fn short_fits_refine_as_often_as_long_ones() {
         let of = |steps| FitConfig { steps, ..FitConfig::default() };
         let runs: Vec<_> = [1, 900, 3000, 7000].map(|steps| of(steps).refine_steps()).into();
         assert_eq!(runs, [(75, 25), (90, 30), (300, 100), (300, 100)]);

@@ -1,9 +1,7 @@
 //! How many splats there are to be.
 
-/// How many splats a run of MCMC's control is to leave of `n`: the number grows by such a factor that
-/// the last of `runs_left` runs, this one included, reaches `max_splats`.
-///
-/// The paper's 5 % a run gets nowhere from few points: 24 runs make three splats of one.
+/// Number of splats after a run of MCMC's control on `n`: a constant growth factor that reaches
+/// `max_splats` in `runs_left` runs. The paper's 5 % per run is too little for few initial points.
 pub(super) fn mcmc_target(n: usize, max_splats: usize, runs_left: u32) -> usize {
     let needed = (max_splats as f64 / n as f64).max(1.0);
     match runs_left {

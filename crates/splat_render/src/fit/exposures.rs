@@ -1,12 +1,12 @@
-//! Exposure and white balance of photos under optimisation: a gain and an offset per channel and
-//! photo, fitted with the splats.
+//! Optimization of photos' exposure and white balance: a gain and an offset per channel and photo, fitted
+//! with the splats.
 //!
-//! Brighter splats and darker gains look the same, and so do offsets of one sign: after each round
-//! the gains' logarithms and the offsets are brought back to a mean of zero, channel by channel. The
-//! splats have the colours of the mean photo.
+//! Brighter splats and darker gains look the same, and so do offsets of one sign: after each round the
+//! gains' logarithms and the offsets are shifted to a mean of zero per channel. The splats then have the
+//! colors of the mean photo.
 //!
-//! Gain and offset of a photo do nearly the same: both make it brighter. Adam works on what sets them
-//! apart: contrast about the photo's mean colour, and that colour itself.
+//! Gain and offset of a photo have nearly the same effect: both brighten it. Adam therefore works on
+//! contrast about the photo's mean color and on that color.
 
 use rayon::prelude::*;
 
@@ -17,17 +17,16 @@ use crate::target::Target;
 
 /// Adam's decay of the moments and its epsilon, as cameras have them: a photo has one step a round.
 const ADAM: (f64, f64, f64) = (0.9, 0.99, 1e-15);
-/// What Adam's rate decays to until the end of the fit, as a part of the start's.
+/// Final rate of Adam as a fraction of the initial rate.
 const DECAY: f64 = 0.03;
-/// The rates at the start add up to this over the rounds of a fit, in logarithms of gain and units of
-/// colour: with the decay, exposures get a bit more than a quarter as far, three stops.
+/// Sum of the initial rates over the rounds of a fit; with the decay, exposures move up to three stops.
 const REACH: f64 = 3.5;
 /// Least and most of the rate at the start.
 const RATES: (f64, f64) = (0.005, 0.05);
-/// Standard error of the start whose pull is 1. No step is longer than what a start leaves open.
+/// Standard error of an initial value with pull 1. Steps are no longer than the initial value's error.
 const UNIT_ERROR: f64 = 0.03;
-/// Least pulls of gains and of offsets. The first decides where a photo shows nothing. Cameras make
-/// few offsets, and against a render that is poor still, the best exposure is all offset and no gain.
+/// Minimum pulls of gains and of offsets. The first matters for photos that constrain nothing. Cameras
+/// cause few offsets; without a pull, the best exposure against a poor render is all offset and no gain.
 const PULLS: (f64, f64) = (1e-3, 5.0);
 /// Gains further from 1 than this factor are none of a camera.
 const GAIN_MAX: f64 = 64.0;
@@ -39,7 +38,7 @@ pub struct ExposureState {
     pub gains: Vec<[f64; 3]>,
     /// Added to R, G and B after it.
     pub offsets: Vec<[f64; 3]>,
-    /// Adam's first moments: contrast of R, G and B, then their mean colour.
+    /// Adam's first moments: contrast of R, G and B, then their mean color.
     pub first: Vec<[f64; 6]>,
     /// Adam's second moments.
     pub second: Vec<[f64; 6]>,
@@ -54,7 +53,7 @@ pub struct ExposureState {
 pub struct Exposures {
     /// Which photos have one of their own.
     is_fitted: Vec<bool>,
-    /// Mean colour of each photo where it counts, 0..1.
+    /// Mean color of each photo's unmasked pixels, 0..1.
     means: Vec<[f64; 3]>,
     /// Gains and offsets that each photo's are pulled to, and how much.
     start: Vec<[[f64; 3]; 2]>,
@@ -82,17 +81,9 @@ impl Exposures {
         }
     }
 
-    /// Sets where the exposures start: a gain above 0 and an offset for each photo, or None for one
-    /// that has the splats' own colours and keeps them. The starts' backgrounds do not count.
-    ///
-    /// What is known of a photo is better than what its render says of it, as long as that is a poor
-    /// one: against a render with errors, a gain seems lower than it is. So each start comes with a
-    /// pull back to it: this times half the squares of what log gains and offsets are off is added to
-    /// the loss.
-    ///
-    /// # Errors
-    /// [`Error::Argument`] if there is not one start and pull for each photo, or one of them cannot be
-    /// used.
+    /// Sets the initial exposures: a gain above 0 and an offset for each photo, or None for a photo whose
+    /// exposure stays neutral. `pulls` times half the squared distances of log gains and offsets from
+    /// them is added to the loss, because a poor render makes gains seem lower than they are.
     pub fn start(&mut self, start: &[Option<Exposure<f64>>], pulls: &[f64]) -> Result<()> {
         let count = self.is_fitted.len();
         if start.len() != count || pulls.len() != count {
@@ -128,10 +119,7 @@ impl Exposures {
         Ok(())
     }
 
-    /// Goes on from a state that [`Exposures::state`] gave.
-    ///
-    /// # Errors
-    /// [`Error::Argument`] if it is of other photos, or holds what is not finite or no gain.
+    /// Resumes from the result of [`Exposures::state`].
     pub fn resume(&mut self, state: ExposureState) -> Result<()> {
         let n = self.is_fitted.len();
         let ExposureState { gains, offsets, first, second, gradients, .. } = &state;
@@ -155,19 +143,19 @@ impl Exposures {
         Ok(())
     }
 
-    /// Where the fit stands.
+    /// The state needed to resume.
     pub fn state(&self) -> &ExposureState {
         &self.state
     }
 
-    /// What a step on a photo corrects the picture by; `background` is that of a photo with alpha.
+    /// The correction of a photo's picture; `background` is the background of a photo with alpha.
     pub fn of(&self, view: usize, background: Option<[f32; 3]>) -> Exposure<f32> {
         let narrow = |values: [f64; 3]| values.map(|v| v as f32);
         let (gain, offset) = (self.state.gains[view], self.state.offsets[view]);
         Exposure { gain: narrow(gain), offset: narrow(offset), background }
     }
 
-    /// Adds gradients of steps to those of the round.
+    /// Adds gradients of steps to the round's.
     pub fn add(&mut self, gradients: &[ExposureGradient]) {
         for gradient in gradients {
             let k = gradient.view;
@@ -190,8 +178,7 @@ impl Exposures {
         }
     }
 
-    /// Moves the exposures by the gradients of the round; `progress` is that of the fit, 0..1, which
-    /// has about so many `rounds`.
+    /// Moves the exposures by the round's gradients; `progress` is in 0..1, `rounds` per fit.
     pub fn step(&mut self, progress: f64, rounds: f64) {
         let decayed = DECAY.powf(progress.clamp(0.0, 1.0));
         let rate = (REACH / rounds.max(1.0)).clamp(RATES.0, RATES.1);
@@ -202,8 +189,7 @@ impl Exposures {
                 continue;
             }
             let (gain, offset, mean) = (self.state.gains[k], self.state.offsets[k], self.means[k]);
-            // More contrast c about the mean: the gain grows, and the offset falls so that what gave
-            // the mean gives it still.
+            // Contrast c about the mean: gain grows and offset falls so that the mean color stays.
             let v: [f64; 6] = std::array::from_fn(|i| match i {
                 0..3 => gain[i] * v[i] - (mean[i] - offset[i]) * v[i + 3],
                 _ => v[i],
@@ -233,8 +219,7 @@ impl Exposures {
         })
     }
 
-    /// Brings the means of log gain and of offset over the fitted photos back to zero, as if the
-    /// splats' colours took them up.
+    /// Shifts the fitted photos' mean log gain and offset to zero; the splats' colors adapt.
     fn anchor(&mut self) {
         let fitted: Vec<usize> = (0..self.is_fitted.len()).filter(|&k| self.is_fitted[k]).collect();
         if fitted.is_empty() {
@@ -245,7 +230,7 @@ impl Exposures {
         for c in 0..3 {
             let scale = (fitted.iter().map(|&k| gains[k][c].ln()).sum::<f64>() / n).exp();
             fitted.iter().for_each(|&k| gains[k][c] /= scale);
-            // Colours higher by `shift` in the splats are higher by gain times that in the photo.
+            // Colors higher by `shift` in the splats are higher by gain times that in the photo.
             let gain: f64 = fitted.iter().map(|&k| gains[k][c]).sum();
             let shift = fitted.iter().map(|&k| offsets[k][c]).sum::<f64>() / gain;
             fitted.iter().for_each(|&k| offsets[k][c] -= gains[k][c] * shift);
@@ -253,7 +238,7 @@ impl Exposures {
     }
 }
 
-/// Mean colour of the pixels that count, by how much they do.
+/// Mean color of the pixels that count, by how much they do.
 fn mean_color(target: &Target) -> [f64; 3] {
     let channels = target.channels as usize;
     let (mut sums, mut total) = ([0.0; 3], 0.0);
@@ -273,17 +258,7 @@ mod tests {
     use super::*;
 
     fn photo(level: u8) -> Target {
-        Target {
-            width: 2,
-            height: 1,
-            channels: 3,
-            pixels: vec![level, level, level, level / 2, level / 2, level / 2],
-            weights: None,
-            depth: None,
-            background: None,
-            turns: 1,
-            until: None,
-        }
+        Target::new(2, 1, 3, [[level; 3], [level / 2; 3]].concat())
     }
 
     fn gradient(view: usize, v_gain: f64, v_offset: f64) -> ExposureGradient {
@@ -291,8 +266,8 @@ mod tests {
     }
 
     #[test]
-    fn exposures_of_photos_of_known_colours_are_found_up_to_their_mean() {
-        // A scene of two colours whose photos have these gains and offsets.
+    fn exposures_of_photos_of_known_colors_are_found_up_to_their_mean() {
+        // A scene of two colors whose photos have these gains and offsets.
         let scene = [0.2, 0.6];
         let truth = [(1.3, 0.002), (0.8, -0.004), (1.0 / (1.3 * 0.8), 0.002)];
         let targets = [photo(200), photo(120), photo(160)];
@@ -340,7 +315,7 @@ mod tests {
     }
 
     #[test]
-    fn a_photo_that_shows_nothing_keeps_its_start() {
+    fn a_pull_holds_an_exposure_near_its_start() {
         let start =
             |gain: f64| Some(Exposure { gain: [gain; 3], offset: [0.0; 3], background: None });
         let targets = [photo(200), photo(120)];

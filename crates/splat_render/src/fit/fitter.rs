@@ -14,7 +14,6 @@ use super::cameras::{CameraState, Cameras, PosePrior, scene_distance};
 use super::config::{Background, DensityControl, FitConfig};
 use super::density;
 use super::exposures::{ExposureState, Exposures};
-use super::hull::Hull;
 use crate::camera::Camera;
 use crate::error::{Error, Result};
 use crate::fit_device::{FitDevice, FitState, McmcRun, OriginalRun, StepInput};
@@ -23,14 +22,14 @@ use crate::target::Target;
 
 /// Part of all steps after which density control runs no more (MCMC; original).
 const REFINE_STOP: (f64, f64) = (0.85, 0.5);
-/// Part of all steps after which MCMC has as many splats as there may be.
+/// Fraction of the steps after which MCMC reaches the maximum number of splats.
 const MCMC_GROWN: f64 = 0.5;
 /// Steps between two opacity resets of the original control.
 const RESET_EVERY: u32 = 3000;
 /// MCMC's pull on opacities and scales (the paper's).
 const MCMC_PULL: (f32, f32) = (0.01, 0.01);
 
-/// What a draw is for; part of its seed.
+/// Purpose of a draw; part of its seed.
 #[derive(Clone, Copy)]
 enum Draw {
     Order = 1,
@@ -43,25 +42,22 @@ enum Draw {
 pub struct Fitter {
     device: Box<dyn FitDevice>,
     config: FitConfig,
-    /// The photos at their whole size, until the device has them; what they are divided by there; and
-    /// their longest side.
+    /// The photos at full size until the device has them, the current reduction, and the longest side.
     photos: Vec<Target>,
     reduction: u32,
     longest: u32,
     cameras: Vec<Camera>,
-    /// The cameras, where they are fitted; `cameras` follows them.
+    /// Set if cameras are fitted; `cameras` are their current values.
     moving: Option<Cameras>,
-    /// Exposures of the photos, where they are fitted.
+    /// Set if exposures are fitted.
     exposures: Option<Exposures>,
     has_alpha: Vec<bool>,
-    /// Each photo's own background, where that is known.
+    /// Each photo's background, if known.
     behind: Vec<Option<[f32; 3]>>,
-    hull: Option<Hull>,
     extent: f32,
     /// How often each photo comes in a round of steps, and the first step that is not of it.
     schedule: Vec<(u32, Option<u32>)>,
-    /// The photos of a round, of those that have not left, each as often as it comes; their order in
-    /// this one; and the step that rounds of these photos began at.
+    /// Active photos with repetitions, this round's order, and the first step of such rounds.
     round: Vec<usize>,
     order: Vec<usize>,
     rounds_from: u32,
@@ -69,8 +65,8 @@ pub struct Fitter {
     step: u32,
 }
 
-/// 1.1 times the largest distance of a camera's centre from their mean (3DGS); 1 where all cameras
-/// stand at one place.
+/// 1.1 times the largest distance of a camera's center from the mean center (3DGS); 1 if all centers
+/// coincide.
 pub fn scene_extent(cameras: &[Camera]) -> f64 {
     let mean = cameras.iter().map(Camera::center).sum::<glam::DVec3>() / cameras.len() as f64;
     let radius = cameras.iter().map(|c| (c.center() - mean).length()).fold(0.0, f64::max);
@@ -78,8 +74,7 @@ pub fn scene_extent(cameras: &[Camera]) -> f64 {
 }
 
 impl Fitter {
-    /// A fit of `state` to `targets`, whose cameras are relative to the scene's origin; `step` steps
-    /// have been done already.
+    /// A fit after `step` steps; cameras are relative to the scene's origin.
     pub fn new(
         mut device: Box<dyn FitDevice>,
         targets: Vec<Target>,
@@ -106,7 +101,7 @@ impl Fitter {
                 return Err(Error::argument(
                     format!("images[{k}]"),
                     format!(
-                        "is {} x {} where its camera is {} x {}",
+                        "is {} x {}, but its camera is {} x {}",
                         target.width, target.height, camera.width, camera.height
                     ),
                 ));
@@ -119,18 +114,14 @@ impl Fitter {
             return Err(Error::argument("splats", "is empty; a fit starts from at least one"));
         }
         if state.splats.sh_degree != config.sh_degree {
-            return Err(Error::argument(
-                "splats",
-                "do not store the SH degree that is to be fitted",
-            ));
+            return Err(Error::argument("splats", "do not store the SH degree to fit"));
         }
         let has_alpha = targets.iter().map(|t| t.channels == 4).collect();
         let behind = targets.iter().map(|t| t.background).collect();
         if targets.iter().all(|target| target.until.is_some()) {
-            return Err(Error::argument("images", "has none that is fitted to until the end"));
+            return Err(Error::argument("images", "has none that is fitted until the end"));
         }
         let schedule = targets.iter().map(|target| (target.turns, target.until)).collect();
-        let hull = config.hull.then(|| Hull::new(&targets));
         let longest = targets.iter().map(|t| t.width.max(t.height)).max().unwrap_or(1);
         let splats = state.moving();
         let moving = config.cameras.map(|moving| {
@@ -152,7 +143,6 @@ impl Fitter {
             exposures,
             has_alpha,
             behind,
-            hull,
             schedule,
             round: Vec::new(),
             order: Vec::new(),
@@ -242,17 +232,13 @@ impl Fitter {
         &self.cameras
     }
 
-    /// What [`Fitter::resume_cameras`] needs, where cameras are fitted.
+    /// The input of [`Fitter::resume_cameras`], if cameras are fitted.
     pub fn camera_state(&mut self) -> Result<Option<CameraState>> {
         self.collect_gradients()?;
         Ok(self.moving.as_ref().map(Cameras::state))
     }
 
-    /// Makes cameras of one number move as one; before pose priors are set.
-    ///
-    /// # Errors
-    /// [`Error::Argument`] if cameras are not fitted, there is not a number for each, or cameras of
-    /// one number do not share a centre.
+    /// Makes cameras of one number move as one; call it before [`Fitter::set_pose_priors`].
     pub fn set_rigs(&mut self, numbers: &[u32]) -> Result<()> {
         let Some(cameras) = self.moving.as_mut() else {
             return Err(Error::argument("rigs", "are of cameras that are not fitted"));
@@ -260,15 +246,7 @@ impl Fitter {
         cameras.set_rigs(numbers)
     }
 
-    /// [`Fitter::set_pose_priors`] under its first name.
-    pub fn hold_cameras(&mut self, holds: Vec<PosePrior>) -> Result<()> {
-        self.set_pose_priors(holds)
-    }
-
-    /// Sets the pose priors of the cameras that are fitted, one for each; before anything else.
-    ///
-    /// # Errors
-    /// [`Error::Argument`] if cameras are not fitted, or the priors are not one per camera.
+    /// Sets the pose priors, one for each fitted camera, before the first step.
     pub fn set_pose_priors(&mut self, priors: Vec<PosePrior>) -> Result<()> {
         let Some(cameras) = self.moving.as_mut() else {
             return Err(Error::argument("holds", "are of cameras that are not fitted"));
@@ -276,7 +254,7 @@ impl Fitter {
         cameras.set_pose_priors(priors)
     }
 
-    /// Goes on with cameras where another fit's had come to.
+    /// Resumes cameras from another fit's state.
     pub fn resume_cameras(&mut self, state: CameraState) -> Result<()> {
         let Some(cameras) = self.moving.as_mut() else {
             return Err(Error::argument("cameras", "are not fitted here"));
@@ -286,10 +264,7 @@ impl Fitter {
         Ok(())
     }
 
-    /// Sets where the exposures that are fitted start; see [`Exposures::start`]. Before anything else.
-    ///
-    /// # Errors
-    /// [`Error::Argument`] if exposures are not fitted, or the starts cannot be used.
+    /// Sets the initial exposures; see [`Exposures::start`]. Call it before any step.
     pub fn start_exposures(
         &mut self,
         start: &[Option<Exposure<f64>>],
@@ -301,7 +276,7 @@ impl Fitter {
         exposures.start(start, pulls)
     }
 
-    /// Goes on with exposures where another fit's had come to.
+    /// Resumes exposures from another fit's state.
     pub fn resume_exposures(&mut self, state: ExposureState) -> Result<()> {
         let Some(exposures) = self.exposures.as_mut() else {
             return Err(Error::argument("exposures", "are not fitted here"));
@@ -309,14 +284,14 @@ impl Fitter {
         exposures.resume(state)
     }
 
-    /// What [`Fitter::resume_exposures`] needs, where exposures are fitted.
+    /// The input of [`Fitter::resume_exposures`], if exposures are fitted.
     pub fn exposure_state(&mut self) -> Result<Option<ExposureState>> {
         self.collect_gradients()?;
         Ok(self.exposures.as_ref().map(|exposures| exposures.state().clone()))
     }
 
-    /// The photo of step `step` (from 0): every photo takes its turns in a round, in a new order each
-    /// round. When some leave, a round of the others begins.
+    /// The photo of step `step` (from 0). Rounds shuffle the active photos, each repeated by its number
+    /// of turns; when a photo leaves, a new round starts.
     fn view(&mut self, step: u32) -> usize {
         let left =
             self.schedule.iter().filter_map(|&(_, until)| until).filter(|&until| until <= step);
@@ -337,7 +312,7 @@ impl Fitter {
         self.order[(step % n) as usize]
     }
 
-    /// One step, density control included where it is due.
+    /// Does one step, and density control if due.
     pub fn step(&mut self) -> Result<()> {
         self.set_reduction()?;
         let step = self.step;
@@ -354,8 +329,8 @@ impl Fitter {
         let progress = f64::from(step) / f64::from(config.steps);
         let rates = config.rates_at(step, self.extent);
         let mcmc = config.density == DensityControl::Mcmc;
-        // Adam makes its full step of a pull that nothing opposes. Where steps are larger, a splat
-        // that few photos show would fade before one of them comes round again.
+        // Adam takes a full step along an unopposed pull. With larger steps, a splat seen in few photos
+        // would fade before one of them comes round again.
         let faster = rates.opacities / config.rates.opacities.max(f32::MIN_POSITIVE);
         let pull = MCMC_PULL.0 / faster.max(1.0).sqrt();
         let noise_seed = self.rng(Draw::Noise, u64::from(step)).random();
@@ -413,29 +388,16 @@ impl Fitter {
             DensityControl::Fixed => 0.0,
         };
         let active = f64::from(step) < stop * f64::from(config.steps);
-        // Splats leave the hull as long as they move.
-        let leaving = self.hull.is_some() && step >= start && step.is_multiple_of(every);
         let refine = active && step >= start && step.is_multiple_of(every);
         let reset = active
             && config.density == DensityControl::Original
             && step.is_multiple_of(RESET_EVERY);
-        if !refine && !reset && !leaving {
+        if !refine && !reset {
             return Ok(());
         }
         let mut rng = self.rng(Draw::Density, u64::from(step));
         let mcmc = refine && config.density == DensityControl::Mcmc;
         let original = refine && config.density == DensityControl::Original;
-        if let Some(hull) = self.hull.as_ref().filter(|_| leaving) {
-            let (splats, cameras) = (&mut self.splats, &self.cameras);
-            let mut change = |state: &mut FitState| {
-                let inside = hull.inside(&state.splats, cameras);
-                if inside.len() < state.splats.len() {
-                    state.select(&inside);
-                }
-                *splats = state.splats.len();
-            };
-            self.device.edit(&mut |state| state.edit_moving(&mut change))?;
-        }
         if original {
             self.splats = self.device.original(&OriginalRun {
                 max_splats: config.max_splats,

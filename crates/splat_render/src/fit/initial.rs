@@ -8,12 +8,11 @@ use crate::splats::SplatArrays;
 
 /// Opacity of a splat that stands for a point (3DGS).
 const OPACITY: f32 = 0.1;
-/// Neighbours whose mean distance sets a point's size (3DGS).
-const NEIGHBOURS: usize = 3;
+/// Neighbors whose mean distance sets a point's size (3DGS).
+const NEIGHBORS: usize = 3;
 
-/// One round splat per point, as large as the mean distance to its three nearest neighbours.
-///
-/// `points` `[P]` world frame less the scene's origin; `colors` `[P]` in 0..1.
+/// Makes a round splat per point, as large as the mean distance to its three nearest neighbors. `points`
+/// are relative to the scene's origin, `colors` in 0..1.
 pub fn splats_from_points(
     points: &[[f32; 3]],
     colors: &[[f32; 3]],
@@ -22,7 +21,7 @@ pub fn splats_from_points(
     if points.len() != colors.len() {
         return Err(Error::argument(
             "colors",
-            format!("has {} rows where points has {}", colors.len(), points.len()),
+            format!("has {} rows, but points has {}", colors.len(), points.len()),
         ));
     }
     // Squared distances of points further out would overflow.
@@ -46,7 +45,7 @@ pub fn splats_from_points(
     let tree = rstar::RTree::bulk_load(points.to_vec());
     out.scales.par_iter_mut().zip(points).for_each(|(scale, point)| {
         // The nearest is the point itself.
-        let near = tree.nearest_neighbor_iter_with_distance_2(point).skip(1).take(NEIGHBOURS);
+        let near = tree.nearest_neighbor_iter_with_distance_2(point).skip(1).take(NEIGHBORS);
         let (sum, count) = near.fold((0.0, 0.0), |(sum, n), (_, d2)| (sum + d2.sqrt(), n + 1.0));
         // Coincident points must not give a size of zero.
         *scale = [(sum / f32::max(count, 1.0)).max(1e-7).ln(); 3];
@@ -59,7 +58,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn size_is_the_mean_distance_to_three_neighbours() {
+    fn size_is_the_mean_distance_to_three_neighbors() {
         let points = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 3.0]];
         let splats = splats_from_points(&points, &[[0.5; 3]; 4], 2).unwrap();
         assert!((splats.scales[0][0] - 2.0f32.ln()).abs() < 1e-6);

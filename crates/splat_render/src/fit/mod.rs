@@ -6,7 +6,6 @@ mod config;
 mod density;
 mod exposures;
 mod fitter;
-mod hull;
 mod initial;
 mod plane_sweep;
 
@@ -15,7 +14,7 @@ pub use config::{Background, DensityControl, FitConfig};
 pub use exposures::{ExposureState, Exposures};
 pub use fitter::{Fitter, scene_extent};
 pub use initial::splats_from_points;
-pub use plane_sweep::{DepthMap, GreyPhoto, Sweep, plane_sweep};
+pub use plane_sweep::{DepthMap, GrayPhoto, Sweep, plane_sweep};
 
 pub use crate::constants::{ADAM, SSIM_C, SSIM_WINDOW};
 pub use crate::fit_device::{
@@ -25,6 +24,3 @@ pub use crate::fit_device::{
 pub use crate::splats::SplatArrays;
 pub use crate::stages::{Exposure, Rates};
 pub use crate::target::{Target, TargetDepth, Weight};
-
-/// [`PosePrior`] under its first name.
-pub use cameras::PosePrior as Hold;

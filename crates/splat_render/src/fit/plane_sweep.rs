@@ -1,4 +1,4 @@
-//! Depth maps of photos by plane sweep (Collins 1996), scored by zero-mean normalised
+//! Depth maps of photos by plane sweep (Collins 1996), scored by zero-mean normalized
 //! cross-correlation, which a photo's exposure does not change.
 
 use glam::{DMat3, DVec3};
@@ -11,32 +11,32 @@ use crate::error::{Error, Result};
 
 /// Patches that are compared have a side of `2 * RADIUS + 1` pixels.
 const RADIUS: usize = 3;
-/// Variance of grey (0..1) that noise has: patches of less have no texture, and score near 0.
+/// Variance of gray (0..1) that noise has: patches of less have no texture, and score near 0.
 const NOISE: f32 = 1e-4;
-/// A depth's score is the mean of so many best photos: others may not see the place.
+/// A depth's score is the mean over this many best photos, since some may not see the surface.
 const BEST: usize = 2;
 
 /// A photo to sweep, or to compare with.
 #[derive(Debug, Clone)]
-pub struct GreyPhoto {
+pub struct GrayPhoto {
     /// Its camera.
     pub camera: Camera,
-    /// `[H * W]` grey in 0..1, row-major.
-    pub grey: Vec<f32>,
+    /// `[H * W]` gray in 0..1, row-major.
+    pub gray: Vec<f32>,
     /// `[H * W]` which pixels count, or None for all.
     pub usable: Option<Vec<bool>>,
 }
 
-/// What a sweep finds for a photo.
+/// Result of a sweep.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DepthMap {
     /// `[H * W]` 1 / z-depth with the best score.
     pub inverse_depth: Vec<f32>,
-    /// `[H * W]` correlation in -1..=1; -1 where no other photo sees any of the depths.
+    /// `[H * W]` correlation in -1..=1; -1 if no other photo sees any of the depths.
     pub score: Vec<f32>,
 }
 
-/// What to do for one photo.
+/// A depth map to compute.
 #[derive(Debug, Clone)]
 pub struct Sweep {
     /// Index of the photo.
@@ -50,37 +50,33 @@ pub struct Sweep {
 }
 
 /// The depth map of each sweep's photo. The same on any number of threads.
-///
-/// # Errors
-/// [`Error::Argument`] if a photo, an index or a range cannot be used.
-pub fn plane_sweep(photos: &[GreyPhoto], sweeps: &[Sweep]) -> Result<Vec<DepthMap>> {
+pub fn plane_sweep(photos: &[GrayPhoto], sweeps: &[Sweep]) -> Result<Vec<DepthMap>> {
     for (k, photo) in photos.iter().enumerate() {
         photo.camera.validate()?;
         let pixels = photo.camera.width as usize * photo.camera.height as usize;
         let usable = photo.usable.as_ref().map_or(pixels, Vec::len);
-        if photo.grey.len() != pixels || usable != pixels {
+        if photo.gray.len() != pixels || usable != pixels {
             return Err(Error::argument(format!("photos[{k}]"), "does not fit its camera's size"));
         }
-        if !photo.grey.iter().all(|v| v.abs() <= 1.0) {
-            return Err(Error::argument(format!("photos[{k}]"), "has grey outside of 0..1"));
+        if !photo.gray.iter().all(|v| v.abs() <= 1.0) {
+            return Err(Error::argument(format!("photos[{k}]"), "has gray outside of 0..1"));
         }
     }
     for (k, sweep) in sweeps.iter().enumerate() {
         let bad = |reason: &str| Err(Error::argument(format!("sweeps[{k}]"), reason));
         if sweep.others.iter().chain([&sweep.photo]).any(|&index| index >= photos.len()) {
-            return bad("names a photo that there is not");
+            return bad("names a photo that does not exist");
         }
         if sweep.planes < 2 || !sweep.range.iter().all(|v| v.is_finite() && *v > 0.0) {
-            return bad("needs two planes at least, at finite depths above 0");
+            return bad("needs at least two planes at finite depths above 0");
         }
     }
     Ok(sweeps.par_iter().map(|sweep| dispatch(Sweeping { photos, sweep })).collect())
 }
 
-/// Compiled for the widest instruction set there is: its loops are plain, for the compiler to turn into
-/// vectors.
+/// Compiled for the machine's widest instruction set; plain loops, which compilers vectorize.
 struct Sweeping<'a> {
-    photos: &'a [GreyPhoto],
+    photos: &'a [GrayPhoto],
     sweep: &'a Sweep,
 }
 
@@ -94,18 +90,18 @@ impl WithSimd for Sweeping<'_> {
         let (width, height) = (photo.camera.width as usize, photo.camera.height as usize);
         let pixels = width * height;
         let mut boxes = Boxes::new(width, height);
-        let own = Patches::of(&photo.grey, &mut boxes);
+        let own = Patches::of(&photo.gray, &mut boxes);
         let mut best = Best::new(pixels);
         let [near, far] = sweep.range;
         let gap = (far - near) / (sweep.planes - 1) as f32;
-        let mut warped = Warped { grey: vec![0.0; pixels], seen: vec![0.0; pixels] };
+        let mut warped = Warped { gray: vec![0.0; pixels], seen: vec![0.0; pixels] };
         let mut top: [Vec<f32>; BEST] = std::array::from_fn(|_| vec![0.0; pixels]);
         for plane in 0..sweep.planes {
             top.iter_mut().for_each(|scores| scores.fill(-1.0));
             for &other in &sweep.others {
                 let warp = Warp::new(&photo.camera, &photos[other]);
                 warp.run(near + gap * plane as f32, width, &mut warped);
-                own.correlate(&photo.grey, &warped, &mut boxes, &mut top);
+                own.correlate(&photo.gray, &warped, &mut boxes, &mut top);
             }
             best.take(plane as u32, &top);
         }
@@ -116,7 +112,7 @@ impl WithSimd for Sweeping<'_> {
     }
 }
 
-/// The best depth so far of each pixel, and its neighbours' scores.
+/// The best depth so far of each pixel, and its neighbors' scores.
 struct Best {
     score: Vec<f32>,
     plane: Vec<u32>,
@@ -156,7 +152,7 @@ impl Best {
         }
     }
 
-    /// Where the parabola through the best score and its neighbours has its top, in planes.
+    /// Position of the maximum of the parabola through the best score and its neighbors, in planes.
     fn between_planes(&self, pixel: usize) -> f32 {
         let (before, score, after) = (self.before[pixel], self.score[pixel], self.after[pixel]);
         let bend = before - 2.0 * score + after;
@@ -169,22 +165,22 @@ impl Best {
 
 /// Another photo as a photo's camera would see it.
 struct Warped {
-    grey: Vec<f32>,
-    /// 1 where the other photo sees the place, else 0.
+    gray: Vec<f32>,
+    /// 1 if the other photo sees the point, else 0.
     seen: Vec<f32>,
 }
 
 /// How a photo's pixels at some depth fall on another photo.
 struct Warp<'a> {
-    other: &'a GreyPhoto,
-    /// Pixel (x, y, 1) of the photo to the other's homogeneous pixel, at infinite depth.
+    other: &'a GrayPhoto,
+    /// Maps the photo's pixel (x, y, 1) to a homogeneous pixel of the second photo, at infinite depth.
     infinite: DMat3,
-    /// What 1 / depth adds to it.
+    /// Added per unit of 1 / depth.
     epipole: DVec3,
 }
 
 impl<'a> Warp<'a> {
-    fn new(camera: &Camera, other: &'a GreyPhoto) -> Self {
+    fn new(camera: &Camera, other: &'a GrayPhoto) -> Self {
         let to = &other.camera;
         let rotation = to.rotation() * camera.rotation().transpose();
         let translation = to.translation() - rotation * camera.translation();
@@ -200,10 +196,10 @@ impl<'a> Warp<'a> {
     #[inline(always)]
     fn run(&self, inverse_depth: f32, width: usize, warped: &mut Warped) {
         let (w, h) = (self.other.camera.width as usize, self.other.camera.height as usize);
-        let (grey, usable) = (self.other.grey.as_slice(), self.other.usable.as_deref());
+        let (gray, usable) = (self.other.gray.as_slice(), self.other.usable.as_deref());
         let along = self.infinite.x_axis.as_vec3();
         let (most_x, most_y) = (w as f32 - 1.0, h as f32 - 1.0);
-        let rows = warped.grey.chunks_exact_mut(width).zip(warped.seen.chunks_exact_mut(width));
+        let rows = warped.gray.chunks_exact_mut(width).zip(warped.seen.chunks_exact_mut(width));
         for (row, (out, seen)) in rows.enumerate() {
             let start = self.infinite * DVec3::new(0.5, row as f64 + 0.5, 1.0)
                 + f64::from(inverse_depth) * self.epipole;
@@ -212,7 +208,7 @@ impl<'a> Warp<'a> {
                 let at = column as f32;
                 let z = start.z + at * along.z;
                 let scale = 1.0 / z.max(1e-6);
-                // Relative to the centre of pixel (0, 0).
+                // Relative to the center of pixel (0, 0).
                 let x = (start.x + at * along.x) * scale - 0.5;
                 let y = (start.y + at * along.y) * scale - 0.5;
                 let inside = z > 1e-6 && x >= 0.0 && y >= 0.0 && x <= most_x && y <= most_y;
@@ -222,8 +218,8 @@ impl<'a> Warp<'a> {
                 let (dx, dy) = (x - left as f32, y - upper as f32);
                 let corners =
                     [upper * w + left, upper * w + right, lower * w + left, lower * w + right];
-                let above = grey[corners[0]] * (1.0 - dx) + grey[corners[1]] * dx;
-                let below = grey[corners[2]] * (1.0 - dx) + grey[corners[3]] * dx;
+                let above = gray[corners[0]] * (1.0 - dx) + gray[corners[1]] * dx;
+                let below = gray[corners[2]] * (1.0 - dx) + gray[corners[3]] * dx;
                 out[column] = above * (1.0 - dy) + below * dy;
                 let counts = match usable {
                     Some(usable) => corners.iter().all(|&corner| usable[corner]),
@@ -235,7 +231,7 @@ impl<'a> Warp<'a> {
     }
 }
 
-/// Mean and variance of a photo's grey in the patch about each pixel.
+/// Mean and variance of a photo's gray in the patch about each pixel.
 struct Patches {
     mean: Vec<f32>,
     variance: Vec<f32>,
@@ -243,10 +239,10 @@ struct Patches {
 
 impl Patches {
     #[inline(always)]
-    fn of(grey: &[f32], boxes: &mut Boxes) -> Self {
-        let mut out = Self { mean: vec![0.0; grey.len()], variance: vec![0.0; grey.len()] };
+    fn of(gray: &[f32], boxes: &mut Boxes) -> Self {
+        let mut out = Self { mean: vec![0.0; gray.len()], variance: vec![0.0; gray.len()] };
         for row in 0..boxes.height + RADIUS {
-            if let Some((pixels, [mean, square, _])) = boxes.next_row(row, grey, grey) {
+            if let Some((pixels, [mean, square, _])) = boxes.next_row(row, gray, gray) {
                 let (means, variances) = (&mut out.mean[pixels.clone()], &mut out.variance[pixels]);
                 for column in 0..mean.len() {
                     means[column] = mean[column];
@@ -261,13 +257,13 @@ impl Patches {
     #[inline(always)]
     fn correlate(
         &self,
-        grey: &[f32],
+        gray: &[f32],
         warped: &Warped,
         boxes: &mut Boxes,
         [first, second]: &mut [Vec<f32>; BEST],
     ) {
         for row in 0..boxes.height + RADIUS {
-            let Some((pixels, [mean, square, product])) = boxes.next_row(row, &warped.grey, grey)
+            let Some((pixels, [mean, square, product])) = boxes.next_row(row, &warped.gray, gray)
             else {
                 continue;
             };
@@ -291,8 +287,7 @@ impl Patches {
 struct Boxes {
     width: usize,
     height: usize,
-    /// Sums along the row of a value, its square and its product with another, for each row of the
-    /// square in turn.
+    /// Row sums of a value, its square and its product with another, for each row of the square.
     rows: [Vec<f32>; 3],
     /// The values with zeros before and after.
     padded: [Vec<f32>; 3],
@@ -319,9 +314,8 @@ impl Boxes {
         }
     }
 
-    /// Adds a row of `values` and of their products with `others`. Returns the means of the row that
-    /// this completes, `RADIUS` further up, and its pixels. Rows come in order, from 0 to the height
-    /// and `RADIUS` more.
+    /// Adds a row of `values` and of their products with `others`, in order. Returns the pixels and means
+    /// of the row that this completes, `RADIUS` further up.
     #[inline(always)]
     fn next_row(
         &mut self,
@@ -355,8 +349,8 @@ impl Boxes {
                 }
             }
         }
-        let centre = row.checked_sub(RADIUS)?;
-        let square = centre.saturating_sub(RADIUS)..(centre + RADIUS + 1).min(self.height);
+        let center = row.checked_sub(RADIUS)?;
+        let square = center.saturating_sub(RADIUS)..(center + RADIUS + 1).min(self.height);
         let scale = 1.0 / square.len() as f32;
         for (means, rows) in self.means.iter_mut().zip(&self.rows) {
             means.fill(0.0);
@@ -371,7 +365,7 @@ impl Boxes {
             }
         }
         let [mean, square, product] = &self.means;
-        Some((centre * width..(centre + 1) * width, [mean, square, product]))
+        Some((center * width..(center + 1) * width, [mean, square, product]))
     }
 }
 
@@ -383,8 +377,8 @@ mod tests {
     const SIZE: usize = 48;
     const DEPTH: f64 = 2.0;
 
-    /// Grey of a textured wall at depth [`DEPTH`] as a camera at (x, 0, 0) sees it.
-    fn photo(x: f64, gain: f32) -> GreyPhoto {
+    /// Gray of a textured wall at depth [`DEPTH`] as a camera at (x, 0, 0) sees it.
+    fn photo(x: f64, gain: f32) -> GrayPhoto {
         let camera = Camera {
             viewmat: DMat4::from_translation(DVec3::new(-x, 0.0, 0.0)),
             fx: 50.0,
@@ -394,13 +388,13 @@ mod tests {
             width: SIZE as u32,
             height: SIZE as u32,
         };
-        let grey = (0..SIZE * SIZE).map(|i| {
+        let gray = (0..SIZE * SIZE).map(|i| {
             let u = ((i % SIZE) as f64 + 0.5 - camera.cx) / camera.fx * DEPTH + x;
             let v = ((i / SIZE) as f64 + 0.5 - camera.cy) / camera.fy * DEPTH;
             let wave = (17.0 * u + 3.0 * v).sin() + (7.0 * v - 23.0 * u * v).cos();
             gain * (0.5 + 0.2 * wave as f32)
         });
-        GreyPhoto { camera, grey: grey.collect(), usable: None }
+        GrayPhoto { camera, gray: gray.collect(), usable: None }
     }
 
     fn sweep(others: &[usize]) -> Sweep {
@@ -420,11 +414,11 @@ mod tests {
     }
 
     #[test]
-    fn says_where_it_knows_nothing() {
+    fn unknown_depths_have_a_low_score() {
         let mut away = photo(0.2, 1.0);
         away.camera.viewmat.w_axis.x = 1e3;
         let mut flat = photo(0.2, 1.0);
-        flat.grey.fill(0.5);
+        flat.gray.fill(0.5);
         let mut masked = photo(0.2, 1.0);
         masked.usable = Some(vec![false; SIZE * SIZE]);
         let photos = [photo(0.0, 1.0), away, flat, masked];
@@ -440,19 +434,19 @@ mod tests {
     }
 
     #[test]
-    fn refuses_what_it_cannot_sweep() {
+    fn invalid_photos_are_refused() {
         let photos = [photo(0.0, 1.0)];
         let error =
-            |photos: &[GreyPhoto], sweep| plane_sweep(photos, &[sweep]).unwrap_err().to_string();
+            |photos: &[GrayPhoto], sweep| plane_sweep(photos, &[sweep]).unwrap_err().to_string();
         assert!(error(&photos, sweep(&[1])).starts_with("sweeps[0]: "));
         assert!(error(&photos, Sweep { planes: 1, ..sweep(&[0]) }).starts_with("sweeps[0]: "));
         let range = [f32::NAN, 1.0];
         assert!(error(&photos, Sweep { range, ..sweep(&[0]) }).starts_with("sweeps[0]: "));
         let mut short = photo(0.0, 1.0);
-        short.grey.pop();
+        short.gray.pop();
         assert!(error(&[short], sweep(&[])).starts_with("photos[0]: "));
         let mut wrong = photo(0.0, 1.0);
-        wrong.grey[3] = f32::NAN;
+        wrong.gray[3] = f32::NAN;
         assert!(error(&[wrong], sweep(&[])).starts_with("photos[0]: "));
     }
 }

@@ -3,7 +3,7 @@
 /// Cells of the bounding box along an axis, along whose curve splats are ordered.
 pub(crate) const CELLS: u32 = 1 << 20;
 
-/// Cells of a bounding box: its low corner and what differences to it are multiplied by.
+/// Cells of a bounding box: its low corner and the scale of offsets from it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Cells {
     pub low: [f32; 3],
@@ -38,8 +38,8 @@ impl Cells {
     }
 }
 
-/// Ids of the points along Morton's curve through the box of the finite ones: neighbours in space become
-/// neighbours in memory, and tiles and pairs of splats near each other, too.
+/// Ids of the points along Morton's curve through the box of the finite ones: neighbors in space become
+/// neighbors in memory, and tiles and pairs of splats near each other, too.
 pub(super) fn cell_order(points: &[[f32; 3]]) -> Vec<usize> {
     let (mut low, mut high) = ([f32::INFINITY; 3], [f32::NEG_INFINITY; 3]);
     for point in points.iter().filter(|point| point.iter().all(|v| v.is_finite())) {
@@ -60,7 +60,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn neighbours_in_space_become_neighbours_in_memory() {
+    fn neighbors_in_space_become_neighbors_in_memory() {
         let order = cell_order(&[[3.0, 0.0, 0.0], [0.0; 3], [2.9, 0.0, 0.0], [f32::NAN; 3]]);
         assert_eq!(order, [1, 3, 2, 0]);
         assert_eq!(cell_order(&[[1.0; 3]; 3]), [0, 1, 2]);

@@ -1,11 +1,8 @@
-//! Fog: splats right before a camera, far nearer than all that it shows.
+//! Fog: splats right in front of a camera, far nearer than the surfaces in its picture.
 //!
-//! A large, faint splat there tints one photo and little else. It explains what photos differ by
-//! (exposure, vignetting) and hides what is behind it, which then has no gradients any more. On
-//! plain walls and tables it can outgrow the scene.
-//!
-//! How near a camera's nearest surface is, the host tells from a sample of the splats. Whether a splat is
-//! before it is asked of every splat, in f32 without anything that rounds differently on a GPU.
+//! Fog explains differences between photos (exposure, vignetting) and hides the scene, which then gets no
+//! gradients. The host estimates each camera's nearest surface from a sample of the splats. Every splat
+//! is compared with it in f32, without operations that round differently on a GPU.
 
 use bytemuck::{Pod, Zeroable};
 
@@ -16,7 +13,7 @@ use crate::fit_device::exp_accurate;
 const NEAREST: f64 = 0.01;
 /// Fog is nearer than this part of that depth.
 const BEFORE: f32 = 0.5;
-/// Splats whose depths tell the nearest surface, at most, and at least.
+/// Maximum and minimum number of splats sampled for the nearest surface.
 const SAMPLES: (usize, usize) = (10_000, 100);
 /// Standard deviations of its longest axis that a splat reaches to.
 const REACH: f32 = 3.0;
@@ -35,13 +32,13 @@ pub(crate) struct FogCamera {
     pub unused: f32,
 }
 
-/// Every so many splats are sampled.
+/// Stride of the sample.
 pub(crate) fn sampled_every(splats: usize) -> usize {
     splats.div_ceil(SAMPLES.0).max(1)
 }
 
 impl FogCamera {
-    /// `sample` has the centres of every [`sampled_every`] splats.
+    /// `sample` has the centers of every [`sampled_every`] splats.
     pub fn new(camera: &Camera, sample: &[[f32; 3]]) -> Self {
         let row = |i: usize| camera.viewmat.row(i).to_array().map(|v| v as f32);
         let mut out = Self {
@@ -62,7 +59,7 @@ impl FogCamera {
         out
     }
 
-    /// Depth of a centre, if it lies before the camera, nearer than its nearest surface, and the picture
+    /// Depth of a center, if it lies before the camera, nearer than its nearest surface, and the picture
     /// shows it, widened by `radius`. As `is_fog` in mcmc_weigh.wgsl.
     fn depth(&self, [x, y, z]: [f32; 3], radius: f32) -> Option<f32> {
         let [u, v, depth] = self.rows.map(|[a, b, c, d]| ((a * x + b * y) + c * z) + d);
@@ -125,12 +122,12 @@ mod tests {
     }
 
     #[test]
-    fn what_is_far_nearer_than_the_nearest_surface_is_fog() {
+    fn splats_far_nearer_than_the_nearest_surface_are_fog() {
         let splats = wall_and(&[
             ([0.1, 0.0, 1.0], 0.5),
             ([0.1, 0.0, 2.5], 0.5),  // not far nearer
             ([0.0, 0.0, -1.0], 0.5), // behind the camera
-            ([3.0, 0.0, 1.0], 0.1),  // beside the picture
+            ([3.0, 0.0, 1.0], 0.1),  // outside the picture
             ([3.0, 0.0, 1.0], 1.0),  // reaches into it
         ]);
         assert_eq!(fog(&splats, &[CAMERA]), [400, 404]);
@@ -141,13 +138,13 @@ mod tests {
     }
 
     #[test]
-    fn a_near_surface_is_none() {
+    fn a_near_surface_is_not_fog() {
         let near: Vec<_> = (0..20).map(|k| ([0.05 * k as f32 - 0.5, 0.3, 1.0], 0.05)).collect();
         assert!(fog(&wall_and(&near), &[CAMERA]).is_empty());
     }
 
     #[test]
-    fn what_is_not_finite_is_passed_over() {
+    fn splats_that_are_not_finite_are_skipped() {
         let splats = wall_and(&[
             ([f32::NAN, 0.0, 1.0], 0.5),
             ([0.0, 0.0, f32::INFINITY], 0.5),

@@ -1,6 +1,6 @@
 //! MCMC's density control (3DGS-MCMC, Kheradmand et al. 2024): dead splats move to living ones, and the
-//! number grows. This is what devices that do it by themselves are held to, bit for bit: weights are
-//! whole numbers, draws are hashes, and what takes powers and logarithms is in a table.
+//! number grows. Devices with an implementation must match this one bit for bit: weights are integers,
+//! draws are hashes, and powers and logarithms come from tables.
 
 use std::sync::OnceLock;
 
@@ -15,18 +15,18 @@ use crate::splats::SplatArrays;
 pub(crate) const LOGIT_DEAD: f32 = -5.293_305;
 /// The logit that fog gets.
 pub(crate) const LOGIT_FOG: f32 = -10.0;
-/// Most splats that share one's opacity (the binomial table's size in the paper's code).
+/// Maximum number of splats that share one opacity (size of the binomial table in the paper's code).
 pub(crate) const SHARES_MAX: usize = 51;
-/// Logits are told apart in bins of this width's inverse, from [`LOGIT_FIRST`] on.
+/// Bins of logits per unit, from [`LOGIT_FIRST`] on.
 pub(crate) const BINS_PER_LOGIT: f32 = 64.0;
-/// Where the first bin begins.
+/// Start of the first bin.
 pub(crate) const LOGIT_FIRST: f32 = -6.0;
 /// Bins of logits: up to 10.
 pub(crate) const BINS: usize = 1024;
 /// One run of the density control.
 #[derive(Debug, Clone)]
 pub struct McmcRun {
-    /// The photos' cameras: what hides right before one is fog and dies.
+    /// The photos' cameras: fog right in front of one dies.
     pub cameras: Vec<Camera>,
     /// How many splats there are to be.
     pub target: usize,
@@ -47,15 +47,15 @@ fn bin(logit: f32) -> usize {
     ((logit - LOGIT_FIRST) * BINS_PER_LOGIT).clamp(0.0, (BINS - 1) as f32) as usize
 }
 
-/// What a living splat weighs, by the bin of its logit: in proportion to its opacity, so that the sum
-/// over `splats` fits 32 bits.
+/// Weights of living splats by the bin of their logit: in proportion to opacity, and so small that the
+/// sum over `splats` fits 32 bits.
 pub(crate) fn weight_table(splats: usize) -> Vec<u32> {
     let most = (u32::MAX as usize / splats.max(1)).min(65_535) as f64;
     (0..BINS).map(|bin| ((sigmoid(middle(bin)) * most).round() as u32).max(1)).collect()
 }
 
-/// What is added to logit and log scales of a splat that becomes so many (3DGS-MCMC, eq. 9), together
-/// looking as it did: `[BINS][SHARES_MAX - 1]`, from two splats on.
+/// Changes of logit and log scales that keep the look of a splat split into several (3DGS-MCMC, eq. 9):
+/// `[BINS][SHARES_MAX - 1]`, from two splats on.
 pub(crate) fn share_table() -> &'static [[f32; 2]] {
     static TABLE: OnceLock<Vec<[f32; 2]>> = OnceLock::new();
     TABLE.get_or_init(|| {
@@ -85,7 +85,7 @@ fn draw(run: &McmcRun, round: u32, k: u32, total: u32) -> u32 {
     ((u64::from(r) * u64::from(total)) >> 32) as u32
 }
 
-/// Whether all that is looked at is finite; colours only in the first round.
+/// Whether all that is looked at is finite; colors only in the first round.
 pub(super) fn finite(splats: &SplatArrays, i: usize, round: u32) -> bool {
     let stride = splats.stride();
     let colors = if round == 0 { &splats.sh[i * stride..(i + 1) * stride] } else { &[] };
@@ -136,7 +136,7 @@ pub(crate) fn mcmc(state: &mut FitState, run: &McmcRun) {
 }
 
 /// Overwrites `targets` with copies of splats that are drawn by weight, sharing opacity and size among
-/// all copies, and restarts the optimiser's moments of all of them.
+/// all copies, and restarts the optimizer's moments of all of them.
 fn spread(state: &mut FitState, run: &McmcRun, round: u32, weights: &[u32], targets: &[usize]) {
     let mut total = 0;
     let sums: Vec<u32> = weights
@@ -245,7 +245,7 @@ mod tests {
     }
 
     #[test]
-    fn the_dead_move_and_the_number_is_met() {
+    fn dead_splats_move_and_the_target_is_reached() {
         let mut state = some(100);
         state.splats.opacities[7] = -20.0;
         state.splats.means[9] = [f32::NAN; 3];
@@ -262,7 +262,7 @@ mod tests {
     }
 
     #[test]
-    fn where_all_are_dead_nothing_moves_and_nothing_grows() {
+    fn dead_scenes_stay_as_they_are() {
         let mut state = some(10);
         state.splats.opacities.fill(-20.0);
         mcmc(&mut state, &run(20));

@@ -1,4 +1,4 @@
-//! Where a fit's steps run: the seam between the fitting loop and the backends.
+//! The interface between the fitting loop and the backends.
 
 mod cell_order;
 mod fog;
@@ -53,14 +53,14 @@ pub struct ExposureGradient {
     pub v_offset: [f64; 3],
 }
 
-/// What one step is to do.
+/// Settings of one step.
 #[derive(Debug, Clone, Copy)]
 pub struct StepInput {
     /// Which target.
     pub view: usize,
     /// Its camera, relative to the scene's origin.
     pub camera: Camera,
-    /// Render background, and what a target with alpha is composited over.
+    /// Background of the render and of a photo with alpha.
     pub background: [f32; 3],
     /// SH degree in use.
     pub sh_degree: u32,
@@ -74,31 +74,47 @@ pub struct StepInput {
     pub opacity_regularizer: f32,
     /// Added to the loss: this times the mean scale (over splats and axes, world units).
     pub scale_regularizer: f32,
-    /// Size of the exploration noise on the centres (3DGS-MCMC, eq. 8), 0 for none. After Adam's
+    /// Size of the exploration noise on the centers (3DGS-MCMC, eq. 8), 0 for none. After Adam's
     /// update: mean += C (z * noise / (1 + exp(-100 (0.005 - opacity)))) with C the splat's 3D
     /// covariance, z from [`noise_normal`] and the parameters as updated.
     pub noise: f32,
-    /// Part of the splats that this step leaves out, those of [`is_dropped`]; the opacities of the
-    /// others are divided by 1 - dropout, so that the picture stays as opaque on the whole.
+    /// Fraction of the splats that this step drops ([`is_dropped`]); the remaining opacities are divided
+    /// by 1 - dropout, which keeps the mean opacity.
     pub dropout: f32,
     /// Seed of noise and dropout; differs from step to step.
     pub noise_seed: u32,
     /// Whether [`FitDevice::camera_gradients`] will ask for this step's.
     pub camera_gradient: bool,
-    /// What the loss of the depth, where the photo has one, is multiplied by; see
-    /// [`Stages::depth_loss`](crate::stages::Stages::depth_loss).
+    /// Weight of [`Stages::depth_loss`](crate::stages::Stages::depth_loss) if the photo has a depth.
     pub depth_weight: f32,
-    /// What the picture is corrected by before the loss; [`FitDevice::exposure_gradients`] then has
-    /// this step's. None compares the picture as it is.
+    /// Exposure correction before the loss, or None. With it, [`FitDevice::exposure_gradients`] includes
+    /// this step's.
     pub exposure: Option<Exposure<f32>>,
 }
 
 impl StepInput {
-    /// Checks what a device is given, against the photos it holds, and returns the step's photo's
-    /// entry: one of `sizes`, `(width, height)` in pixels.
-    ///
-    /// # Errors
-    /// [`Error::Argument`] that names the field.
+    /// A first step that moves nothing, over black, without noise, dropout or depths.
+    pub fn new(view: usize, camera: Camera) -> Self {
+        Self {
+            view,
+            camera,
+            background: [0.0; 3],
+            sh_degree: 0,
+            rates: Rates::ZERO,
+            step: 1,
+            ssim_weight: 0.2,
+            opacity_regularizer: 0.0,
+            scale_regularizer: 0.0,
+            noise: 0.0,
+            dropout: 0.0,
+            noise_seed: 0,
+            camera_gradient: false,
+            depth_weight: 0.0,
+            exposure: None,
+        }
+    }
+
+    /// Checks the settings against the sizes of the device's photos, `(width, height)` in pixels.
     pub fn validate(&self, sizes: impl ExactSizeIterator<Item = (u32, u32)>) -> Result<()> {
         let (count, mut sizes) = (sizes.len(), sizes);
         let Some((width, height)) = sizes.nth(self.view) else {
@@ -112,7 +128,7 @@ impl StepInput {
             return Err(Error::argument(
                 "camera",
                 format!(
-                    "is {} x {} where its photo is {width} x {height}",
+                    "is {} x {}, but its photo is {width} x {height}",
                     self.camera.width, self.camera.height
                 ),
             ));
@@ -126,7 +142,7 @@ impl StepInput {
         if !(0.0..=1.0).contains(&self.ssim_weight) {
             return Err(Error::argument(
                 "ssim_weight",
-                format!("must lie in 0..=1, got {}", self.ssim_weight),
+                format!("must be in 0..=1, got {}", self.ssim_weight),
             ));
         }
         if !(self.depth_weight.is_finite() && self.depth_weight >= 0.0) {
@@ -141,7 +157,7 @@ impl StepInput {
         self.adam().validate()
     }
 
-    /// The optimiser's part of the step.
+    /// The optimizer's part of the step.
     pub fn adam(&self) -> AdamStep {
         AdamStep {
             number: self.step,
@@ -155,15 +171,16 @@ impl StepInput {
     }
 }
 
-/// A backend that keeps splats, optimiser state and photos where its kernels run.
+/// A backend that keeps splats, optimizer state and photos on its device.
 ///
-/// The loss is `sum_p w_p ((1 - s) mean_c |x - y| + s (1 - mean_c SSIM)) / sum_p w_p` over pixels p
-/// and channels c, with s the SSIM weight, zero padding in the window, plus the loss of the depth,
-/// where the photo has one, and the two regularisers.
-/// Every parameter takes an Adam step in every step, seen or not; colours of splats that are not seen may
-/// take theirs later, with the same bits (on GPUs whose driver fuses multiply-adds alike in both kernels). With [`Rates::ZERO`] nothing moves
-/// ([`AdamStep::is_frozen`]): no parameter, no moment, no noise; the loss, the density statistics and
-/// the cameras' gradients are as ever.
+/// The loss is `sum_p w_p ((1 - s) mean_c |x - y| + s (1 - mean_c SSIM)) / sum_p w_p` over pixels p and
+/// channels c, with s the SSIM weight and zero padding in the window, plus the depth loss if the photo
+/// has a depth, and the two regularizers.
+///
+/// Every parameter takes an Adam step in every step, seen or not. Colors of unseen splats may take theirs
+/// later, with the same bits (on GPUs whose driver fuses multiply-adds alike in both kernels). With
+/// [`Rates::ZERO`] nothing moves ([`AdamStep::is_frozen`]): no parameter, no moment, no noise; the loss,
+/// the density statistics and the cameras' gradients are computed as usual.
 pub trait FitDevice: Send {
     /// Takes the photos, once.
     fn set_targets(&mut self, targets: Vec<Target>) -> Result<()>;
@@ -181,17 +198,17 @@ pub trait FitDevice: Send {
         self.upload(state)
     }
 
-    /// Lets dead splats move to living ones and their number grow (3DGS-MCMC); returns the number of those that move. Bits
-    /// are the same on every device, but for the rounding of whether a splat is fog on GPUs that fuse
-    /// multiplications with additions.
+    /// Moves dead splats to living ones and adds splats (3DGS-MCMC); returns the number of splats that
+    /// are not frozen. Bits are the same on every device, except for the rounding in the fog test on GPUs
+    /// that fuse multiplications with additions.
     fn mcmc(&mut self, run: &McmcRun) -> Result<usize> {
         control_on_host(self, &|state| mcmc(state, run))
     }
 
-    /// Lets splats be cloned, split and pruned by the statistics so far (3DGS), which begin anew; returns
-    /// the number of those that move. Bits are the same on every device, but for the rounding of where
-    /// the halves of a split come to lie on GPUs that fuse multiplications with additions or round
-    /// quotients otherwise.
+    /// Clones, splits and prunes splats by the statistics so far (3DGS), and resets the statistics;
+    /// returns the number of splats that are not frozen. Bits are the same on every device, except for
+    /// the positions of the halves of a split on GPUs that fuse multiplications with additions or round
+    /// quotients differently.
     fn original(&mut self, run: &OriginalRun) -> Result<usize> {
         control_on_host(self, &|state| original(state, run))
     }
@@ -211,7 +228,7 @@ pub trait FitDevice: Send {
     /// Gradients of the exposures of all steps since the last call that had one, in order.
     fn exposure_gradients(&mut self) -> Result<Vec<ExposureGradient>>;
 
-    /// Loss of the last step (before its update, regularisers not included).
+    /// Loss of the last step (before its update, regularizers not included).
     fn loss(&mut self) -> Result<f32>;
 }
 

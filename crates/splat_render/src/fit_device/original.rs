@@ -1,7 +1,7 @@
-//! The original density control (3DGS, Kerbl et al. 2023): clone small and split large splats whose
-//! projected centre keeps being pulled, then prune faint ones. This is what devices that do it by
-//! themselves are held to, bit for bit: pulls are whole numbers, draws are hashes, sizes are compared by
-//! their logarithms.
+//! The original density control (3DGS, Kerbl et al. 2023): clones small and splits large splats with a
+//! persistent pull on their projected center, then prunes faint ones. Devices with an implementation must
+//! match this one bit for bit: pulls are integers, draws are hashes, sizes are compared by their
+//! logarithms.
 
 use std::cmp::Reverse;
 
@@ -14,30 +14,30 @@ use crate::splats::SplatArrays;
 
 /// Pulls are counted in units of a 2^-24th of half the image.
 pub(crate) const PULL_UNITS: f32 = 16_777_216.0;
-/// Longest sum of gradients that is told from longer ones.
+/// Cap on the sum of gradients.
 pub(crate) const PULL_SUM_MAX: f32 = 255.0;
-/// Mean gradient of the projected centre above which splats are added: 2e-4.
+/// Mean gradient of the projected center above which splats are added: 2e-4.
 pub(crate) const PULL_GROW: u32 = 3355;
 /// Splats larger than this part of the scene's extent are split, smaller ones cloned.
 const SCALE_SPLIT: f64 = 0.01;
-/// Splats larger than this part of the extent are removed, where huge ones are.
+/// Size, as a fraction of the extent, beyond which huge splats are pruned.
 const SCALE_HUGE: f64 = 0.1;
-/// What a split takes from log scales: ln 1.6.
+/// Decrease of log scales in a split: ln 1.6.
 pub(crate) const LOG_SPLIT_SHRINK: f32 = 0.470_003_63;
 /// Logit of the opacity that a reset leaves at most: 0.01.
 pub(crate) const LOGIT_RESET: f32 = -4.595_12;
-/// Bits of the least number that is kept where halves are placed: twice the least normal one, as some
-/// devices tell what is too small before they round, and others after.
+/// Bits of the smallest number that the placement of halves keeps: twice the smallest normal number,
+/// since some devices test for underflow before they round and others after.
 pub(crate) const KEPT_BITS_MIN: u32 = 0x0100_0000;
-/// Less the bits of a number from 1 to 2, those of its inverse to 12 %.
+/// This minus the bits of a number from 1 to 2 gives the bits of its inverse to 12 %.
 pub(crate) const INVERSE_GUESS: u32 = 0x7ef3_11c7;
 
 /// One run of the density control.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct OriginalRun {
-    /// Most splats there may be.
+    /// Maximum number of splats.
     pub max_splats: usize,
-    /// The scene's extent, world units, which tells large splats from small ones.
+    /// The scene's extent, world units, which separates large splats from small ones.
     pub extent: f32,
     /// Whether splats that are too large are removed as well.
     pub prune_huge: bool,
@@ -53,7 +53,7 @@ impl OriginalRun {
     }
 }
 
-/// The mean gradient of a splat's projected centre, in [`PULL_UNITS`].
+/// The mean gradient of a splat's projected center, in [`PULL_UNITS`].
 fn pull(grad_sum: f32, seen: f32) -> u32 {
     if !(grad_sum.is_finite() && seen.is_finite()) {
         return 0;
@@ -75,7 +75,7 @@ fn draw(seed: u32, splat: u32, half: u32) -> [f32; 3] {
     })
 }
 
-/// e^x to 0.4 %, in whole numbers: compilers of GPUs rearrange what takes several roundings.
+/// e^x to 0.4 %, in integers: GPU compilers rearrange expressions that round several times.
 fn exp(x: f32) -> f32 {
     // log2(e) and the result's exponent and fraction, all times 2^16.
     let power = (x.clamp(-87.0, 88.0) * 94_548.27).floor() as i32;
@@ -85,7 +85,7 @@ fn exp(x: f32) -> f32 {
     f32::from_bits((((power >> 16) + 127) as u32) << 23 | (fraction - bend) << 7)
 }
 
-/// What one operation made, or 0 where that is tiny: some devices flush such numbers.
+/// The result of one operation, or 0 if it is tiny: some devices flush such numbers.
 fn kept(x: f32) -> f32 {
     if x.to_bits() & 0x7fff_ffff < KEPT_BITS_MIN { 0.0 } else { x }
 }
@@ -110,8 +110,8 @@ fn two_over(x: f32) -> f32 {
     kept(f32::from_bits(inverse.to_bits() + 0x4000_0000 - (bits & 0x7f80_0000)))
 }
 
-/// Where one of the halves of splat `i` comes to lie. Every product and every sum is rounded on its own,
-/// as `half_mean` of original_draw.wgsl has it.
+/// Position of one of the halves of splat `i`. Products and sums are rounded separately, as in
+/// `half_mean` of original_draw.wgsl.
 fn half_mean(splats: &SplatArrays, i: usize, draw: [f32; 3]) -> [f32; 3] {
     let mean = splats.means[i];
     let [w, x, y, z] = splats.quats[i].map(kept);
@@ -149,7 +149,7 @@ pub(crate) fn original(state: &mut FitState, run: &OriginalRun) {
     let pulls: Vec<u32> = (0..n)
         .map(|i| {
             let sum = pull(state.stats.grad_sum[i], state.stats.seen[i]);
-            // What is not finite is pruned anyway.
+            // Splats that are not finite are pruned anyway.
             if finite(&state.splats, i, 0) { sum } else { 0 }
         })
         .collect();
@@ -187,7 +187,7 @@ pub(crate) fn original(state: &mut FitState, run: &OriginalRun) {
                 && largest(splats.scales[i]) <= log_huge
         })
         .collect();
-    // A fit without splats cannot recover: keep what there is.
+    // A fit without splats cannot recover: keep all.
     if !keep.is_empty() {
         state.select(&keep);
     }
@@ -237,7 +237,7 @@ mod tests {
     }
 
     #[test]
-    fn large_ones_split_small_ones_are_cloned_and_faint_ones_go() {
+    fn large_splats_are_split_small_ones_cloned_and_faint_ones_removed() {
         let mut state = some(5);
         state.stats.seen = vec![2.0; 5];
         state.stats.grad_sum = vec![1.0, 1.0, 3e-4, 0.0, 1.0];
@@ -264,7 +264,7 @@ mod tests {
     }
 
     #[test]
-    fn under_the_cap_those_pulled_hardest_grow() {
+    fn under_the_cap_the_largest_gradients_grow() {
         let mut state = some(4);
         state.stats.seen = vec![1.0, 4.0, 0.0, 1.0];
         state.stats.grad_sum = vec![0.5, 4.0, 0.7, f32::NAN];
@@ -278,7 +278,7 @@ mod tests {
     }
 
     #[test]
-    fn huge_ones_go_where_asked_and_a_scene_is_never_emptied() {
+    fn huge_splats_are_removed_on_request_and_a_scene_is_never_emptied() {
         let mut state = some(3);
         state.splats.scales[1][2] = 0.1;
         let huge = OriginalRun { prune_huge: true, ..run(3) };
@@ -296,7 +296,7 @@ mod tests {
     }
 
     #[test]
-    fn whole_numbers_give_the_exponential() {
+    fn exp_is_accurate_to_0_4_percent() {
         for k in -860..=870 {
             let x = 0.1 * k as f32;
             let off = f64::from(exp(x)) / f64::from(x).exp() - 1.0;
@@ -306,7 +306,7 @@ mod tests {
     }
 
     #[test]
-    fn products_and_sums_give_two_over_a_number() {
+    fn two_over_is_accurate() {
         let mut worst = 0.0f64;
         // Every power of two that a squared norm can have, and between them 2000 numbers.
         for power in -40..126 {
@@ -319,7 +319,7 @@ mod tests {
         let last = f32::from_bits(0x3fff_ffff);
         worst = worst.max((f64::from(two_over(last)) * f64::from(last) / 2.0 - 1.0).abs());
         assert!(worst < 1e-7, "{worst}");
-        // What is larger than that has 0: of 2 / x a device may keep nothing.
+        // Larger numbers give 0: a device may flush 2 / x.
         for x in [2f32.powi(126) * 1.5, f32::MAX] {
             assert_eq!(two_over(x), 0.0);
         }
@@ -339,7 +339,7 @@ mod tests {
     }
 
     #[test]
-    fn halves_lie_as_the_splat_does() {
+    fn halves_are_placed_along_the_splat() {
         let mut splats = SplatArrays::zeros(1, 0);
         splats.means[0] = [1.0, 2.0, 3.0];
         // A quarter turn about z brings the long axis x to y.

@@ -1,5 +1,5 @@
-//! What is random in a step: which splats it leaves out and the exploration noise. Each draw comes
-//! from a seed and a splat's index, the same on every device.
+//! Random numbers of a step: dropped splats and exploration noise. A draw is a hash of a seed and a
+//! splat's index, the same on every device.
 
 /// PCG's output function on one 32-bit word.
 #[inline(always)]
@@ -32,8 +32,7 @@ pub(crate) fn dropout_threshold(rate: f32) -> u32 {
     (f64::from(rate) * 4_294_967_296.0) as u32
 }
 
-/// Whether a step with this seed and dropout leaves out the splat `index` (DropGaussian, Park et
-/// al. 2025). The same on every backend.
+/// Whether a step drops the splat `index` (DropGaussian, Park et al. 2025); same on every backend.
 pub fn is_dropped(seed: u32, index: u32, rate: f32) -> bool {
     hash(index ^ hash(seed ^ 0x5bd1_e995)) < dropout_threshold(rate)
 }
@@ -65,7 +64,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn dropout_leaves_out_its_part_and_other_splats_each_step() {
+    fn dropout_leaves_out_other_splats_at_each_step() {
         let dropped = |seed, rate| (0..100_000).filter(move |&i| is_dropped(seed, i, rate));
         assert_eq!(dropped(3, 0.0).count(), 0);
         for (seed, rate) in [(0, 0.1), (7, 0.3), (u32::MAX, 0.9)] {

@@ -1,9 +1,9 @@
-//! What a device holds of a fit: splats, Adam's moments and what density control watches.
+//! A fit's state on a device: splats, Adam's moments and density statistics.
 
 use crate::error::{Error, Result};
 use crate::splats::SplatArrays;
 
-/// What density control needs to know of each splat since it last ran.
+/// Statistics of each splat since the last density control.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct DensityStats {
     /// `[N]` sum over steps of the length of v_means2d in units of half the image's sides
@@ -31,12 +31,12 @@ pub struct FitState {
     pub second: SplatArrays,
     /// Since density control last ran.
     pub stats: DensityStats,
-    /// So many splats, the last ones, are drawn and never changed.
+    /// Number of splats at the end of the arrays that are drawn and never changed.
     pub frozen: usize,
 }
 
 impl FitState {
-    /// Fresh optimiser state around `splats`.
+    /// Fresh optimizer state around `splats`.
     pub fn new(splats: SplatArrays) -> Self {
         let (n, degree) = (splats.len(), splats.sh_degree);
         Self {
@@ -102,7 +102,7 @@ impl FitState {
         if self.frozen > 0 && self.frozen >= n {
             return Err(Error::argument(
                 "frozen_splats",
-                format!("must be fewer than the {n} splats there are, got {}", self.frozen),
+                format!("must be fewer than the {n} splats, got {}", self.frozen),
             ));
         }
         Ok(())

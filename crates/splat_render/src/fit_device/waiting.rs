@@ -1,17 +1,16 @@
-//! Steps that colours wait for. A splat that a step's photo does not show has no gradient of its colours,
-//! so that what the optimiser does to them needs nothing but the step's rates: it is done when the splat
-//! is next seen, or when someone asks for all colours, by the same operations in the same order.
+//! Delayed color updates. A splat that is not in a step's photo has no color gradient, so its update
+//! depends only on the step's rates. It is done when the splat is next seen or when all colors are read,
+//! by the same operations in the same order.
 
 use crate::stages::AdamStep;
 
-/// Steps that colours wait for, at most. Whoever waits longer is brought up to date with all others, so
-/// that no kernel goes through more than so many steps at once.
+/// Maximum number of steps that colors wait. It bounds the steps that a kernel does at once.
 pub const COLOR_WAIT: usize = 128;
 
-/// What a step does to all colours, gradients apart.
+/// A step's effect on all colors, apart from gradients.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct ColorStep {
-    /// Rates of the first coefficient and of the others.
+    /// Rates of the first coefficient and the rest.
     pub sh0: f32,
     pub sh_rest: f32,
     /// Bias corrections of the first and the second moment.
@@ -25,7 +24,7 @@ impl ColorStep {
     }
 }
 
-/// The steps since all colours were last up to date.
+/// The steps since all colors were last up to date.
 #[derive(Debug, Clone)]
 pub(crate) struct WaitingSteps {
     steps: Vec<ColorStep>,
@@ -41,12 +40,12 @@ impl Default for WaitingSteps {
 }
 
 impl WaitingSteps {
-    /// Of which there are never more than `most`, at least 1 and at most [`COLOR_WAIT`].
+    /// A list of at most `most` steps, clamped to 1..=[`COLOR_WAIT`].
     pub fn at_most(most: usize) -> Self {
         Self { steps: Vec::new(), degree: 0, most: most.clamp(1, COLOR_WAIT) }
     }
 
-    /// Whether all colours must be brought up to date before `step`.
+    /// Whether all colors must be brought up to date before `step`.
     pub fn must_end_before(&self, step: &AdamStep) -> bool {
         let others = step.is_frozen() || step.sh_degree != self.degree;
         !self.steps.is_empty() && (others || self.steps.len() == self.most)
@@ -60,7 +59,7 @@ impl WaitingSteps {
         }
     }
 
-    /// All colours are up to date.
+    /// All colors are up to date.
     pub fn clear(&mut self) {
         self.steps.clear();
     }
@@ -80,7 +79,7 @@ mod tests {
     use super::*;
     use crate::stages::Rates;
 
-    /// Rates and corrections are those of Adam (Kingma and Ba 2015, algorithm 1) at the step's own number.
+    /// Rates and corrections match Adam's (Kingma and Ba 2015, algorithm 1) at the step's number.
     #[test]
     fn a_step_keeps_its_own_rates_and_corrections() {
         let rates = Rates { sh0: 0.25, sh_rest: 0.0125, ..Rates::ZERO };

@@ -1,40 +1,37 @@
-//! adam: one optimiser step of all parameters, the exploration noise, and what density control
-//! watches. In fits colours wait ([`super::waiting_colors`]).
+//! adam: one optimizer step of all parameters, the exploration noise, and density statistics. In fits,
+//! colors wait ([`super::waiting_colors`]).
 
 use std::ops::Range;
 
 use super::bin::SplatBins;
 use super::device::{Gpu, Op};
+use super::kernels::Kernel;
 use super::layout::{
     GEOMETRY, GRADIENT, NOTE_PULL, NOTE_SEEN, NOTES, SPLATS_PER_GROUP, Step, View,
 };
 use super::project::{Projection, SPLAT_2D, SplatBuffers, rows, window_uniform};
 use super::project_backward::GradientBuffers;
-use super::shaders::Kernel;
 use crate::error::Result;
 use crate::fit_device::DensityStats;
 use crate::splats::{SplatArrays, SplatParams};
 use crate::stages::{AdamState, AdamStep, SplatGradients};
 
-/// Floats of colour per workgroup.
+/// Floats of color per workgroup.
 const COLOR_FLOATS_PER_GROUP: u32 = 256;
 
-/// Splats under optimisation, on the device.
+/// Splats under optimization, on the device.
 #[derive(Debug)]
 pub(super) struct AdamBuffers {
-    /// Parameters.
     pub splats: SplatBuffers,
-    /// First moments.
     pub first: SplatBuffers,
-    /// Second moments.
     pub second: SplatBuffers,
     /// `[N * NOTES]`
     pub notes: wgpu::Buffer,
-    /// So many splats, the first ones, are moved.
+    /// Number of splats, from the first, that are moved.
     pub moving: u32,
 }
 
-/// What a step of a fit reads besides [`AdamBuffers`].
+/// Input of a fit's step besides [`AdamBuffers`].
 #[derive(Debug)]
 pub(super) struct AdamInput<'a> {
     /// The camera and its 2D splats.
@@ -47,7 +44,7 @@ pub(super) struct AdamInput<'a> {
     pub v_splats2d: &'a wgpu::Buffer,
 }
 
-/// Parameters or moments from what their buffers hold.
+/// Parameters or moments from the bytes of their buffers.
 fn arrays_from_bytes(geometry: &[u8], colors: &[u8], sh_degree: u32) -> SplatArrays {
     let mut out = SplatArrays {
         sh: bytemuck::pod_collect_to_vec(colors),
@@ -65,8 +62,7 @@ fn arrays_from_bytes(geometry: &[u8], colors: &[u8], sh_degree: u32) -> SplatArr
 }
 
 impl AdamBuffers {
-    /// Copies parameters, first and second moments, and statistics to the device, of splats of which
-    /// the first `moving` are moved.
+    /// Copies parameters, moments and statistics to the device; the first `moving` splats are moved.
     pub fn upload(
         gpu: &Gpu,
         [splats, first, second]: [SplatParams<'_, f32>; 3],
@@ -82,7 +78,7 @@ impl AdamBuffers {
         })
     }
 
-    /// Room for so many splats, of which nothing is known yet.
+    /// Uninitialized buffers for `splats` splats.
     pub fn new(gpu: &Gpu, splats: u32, color_floats: u64) -> Result<Self> {
         let arrays = || SplatBuffers::new(gpu, splats, color_floats);
         Ok(Self {
@@ -119,7 +115,7 @@ impl AdamBuffers {
         Ok((arrays, stats))
     }
 
-    /// project_backward, the step of all but colours, and the statistics.
+    /// project_backward, the step of all but colors, and the statistics.
     pub fn fit_ops(&self, gpu: &Gpu, input: &AdamInput<'_>, bins: &SplatBins) -> Vec<Op> {
         let Self { splats, first, second, notes, .. } = self;
         let (geometry, colors) = (GEOMETRY as u64, splats.color_floats);
@@ -143,7 +139,7 @@ impl AdamBuffers {
         splats.windows(gpu).into_iter().map(op).collect()
     }
 
-    /// The step of all but colours, from these gradients.
+    /// The step of all but colors, from these gradients.
     fn geometry_ops(&self, gpu: &Gpu, step: &wgpu::Buffer, gradient: &wgpu::Buffer) -> Vec<Op> {
         let Self { splats, first, second, .. } = self;
         let op = |window: Range<u32>| {
@@ -163,7 +159,7 @@ impl AdamBuffers {
         splats.windows(gpu).into_iter().map(op).collect()
     }
 
-    /// The step of colours, from these gradients.
+    /// The step of colors, from these gradients.
     fn color_ops(&self, gpu: &Gpu, [view, step, gradient]: [&wgpu::Buffer; 3]) -> Vec<Op> {
         let Self { splats, first, second, .. } = self;
         let floats = splats.color_floats;
@@ -186,7 +182,7 @@ impl AdamBuffers {
     }
 }
 
-/// What is noted of each splat where its colours are up to date.
+/// The notes of splats whose colors are up to date.
 fn note_rows(stats: &DensityStats) -> Vec<[f32; NOTES]> {
     let row = |(&pull, &seen)| {
         let mut row = [0.0; NOTES];

@@ -8,9 +8,9 @@ use std::ops::Range;
 use bytemuck::Zeroable;
 
 use super::device::{Gpu, Groups, Op};
+use super::kernels::Kernel;
 use super::layout::{ALL_SPLATS, Chunk, ChunkCount, SortPass, StatusHead};
 use super::project::Projection;
-use super::shaders::Kernel;
 use crate::constants::TILE;
 use crate::error::{Error, Result};
 
@@ -20,7 +20,7 @@ pub(super) struct SplatBins {
     splats: u32,
     keys: [wgpu::Buffer; 2],
     order: [wgpu::Buffer; 2],
-    /// Where each rank's pairs begin, and the total.
+    /// Start of each rank's pairs, and the total.
     pub offsets: wgpu::Buffer,
     segment_sums: wgpu::Buffer,
     histogram: wgpu::Buffer,
@@ -38,7 +38,7 @@ pub(super) struct PairBins {
     keys: [wgpu::Buffer; 2],
     slots: [wgpu::Buffer; 2],
     splat_from_slot: wgpu::Buffer,
-    /// Where each tile's pairs begin, where those behind all tiles do, and their number.
+    /// Start of each tile's pairs, the end of all tiles' pairs, and the number of pairs.
     pub tile_begin: wgpu::Buffer,
 }
 
@@ -46,14 +46,12 @@ pub(super) struct PairBins {
 #[derive(Debug)]
 pub(super) struct TileChunk {
     pub chunk: Chunk,
-    /// `chunk` as the kernels read it.
     pub uniform: wgpu::Buffer,
     /// The same for each dispatch of the rasterize kernels, which walk a part of all lists each.
     pub passes: Vec<wgpu::Buffer>,
 }
 
 impl TileChunk {
-    /// Of the given tiles.
     pub fn new(gpu: &Gpu, chunk: Chunk) -> Self {
         let chunk = Chunk { groups_max: gpu.groups_max, ..chunk };
         // A splat is in a tile's list once at most.
@@ -68,24 +66,21 @@ impl TileChunk {
         Self { chunk, uniform: gpu.uniform(&chunk), passes }
     }
 
-    /// Number of tiles.
     pub fn tiles(&self) -> u32 {
         self.chunk.tile_end - self.chunk.tile_begin
     }
 }
 
-/// Tiles of a picture.
 pub(super) fn tile_count(width: u32, height: u32) -> u32 {
     width.div_ceil(TILE) * height.div_ceil(TILE)
 }
 
-/// Most pairs whose gradient slots of so many floats can be bound at once.
+/// Maximum number of pairs whose gradient slots of `slot_floats` floats can be bound at once.
 pub(super) fn pair_limit(gpu: &Gpu, slot_floats: usize) -> u32 {
     (gpu.binding_limit / (slot_floats as u64 * 4)).min(u64::from(u32::MAX / 2)) as u32
 }
 
 impl SplatBins {
-    /// For `splats` splats and `chunks` chunks.
     pub fn new(gpu: &Gpu, splats: u32, chunks: u32) -> Result<Self> {
         let words = |n: u32| u64::from(n) * 4;
         let pair = |label| -> Result<[wgpu::Buffer; 2]> {
@@ -106,17 +101,17 @@ impl SplatBins {
         })
     }
 
-    /// Bytes of [`Self::status`] for so many chunks.
+    /// Bytes of [`Self::status`] for `chunks` chunks.
     pub fn status_bytes(chunks: u32) -> u64 {
         size_of::<StatusHead>() as u64 + u64::from(chunks.max(1)) * size_of::<ChunkCount>() as u64
     }
 
-    /// Splats by depth; what the sort leaves here, after an even number of passes.
+    /// Splats by depth; the result of the sort after an even number of passes.
     pub fn order(&self) -> &wgpu::Buffer {
         &self.order[0]
     }
 
-    /// Where the depth keys are to be before [`Self::depth_ops`].
+    /// The depth keys, input of [`Self::depth_ops`].
     pub fn keys(&self) -> &wgpu::Buffer {
         &self.keys[0]
     }
@@ -146,7 +141,7 @@ impl SplatBins {
         self.sort_ops(gpu, first, passes, &self.keys, &self.order)
     }
 
-    /// Sorts what [`Self::depth_ops`] has left with all splats by other keys; equal ones keep their order.
+    /// Sorts all splats in the order of [`Self::depth_ops`] by other keys; stable.
     pub fn resort_ops(&self, gpu: &Gpu) -> Vec<Op> {
         let first = SortPass { chunk: ALL_SPLATS, ..SortPass::zeroed() };
         self.sort_ops(gpu, first, u32::BITS / gpu.digit_bits(), &self.keys, &self.order)
@@ -157,8 +152,7 @@ impl SplatBins {
         Groups::Indirect(self.dispatches.clone(), 0)
     }
 
-    /// A dispatch of workgroups of 64 splats of all each, once pairs were counted; of none where they did
-    /// not fit.
+    /// Indirect groups of 64 of all splats once pairs are counted; none if the pairs do not fit.
     pub fn of_all(&self) -> Groups {
         Groups::Indirect(self.dispatches.clone(), 12)
     }
@@ -273,8 +267,7 @@ impl SplatBins {
         ops
     }
 
-    /// Cuts a picture's tiles into chunks whose pairs fit; reads the counts back. The depth order
-    /// must be there.
+    /// Cuts tiles into chunks whose pairs fit; reads the counts back. Needs the depth order.
     pub fn plan(
         &self,
         gpu: &Gpu,
@@ -300,7 +293,7 @@ impl SplatBins {
                 return Err(Error::argument(
                     "means",
                     format!(
-                        "{} splats lie in one 16x16 tile, the device takes {limit}; use fewer \
+                        "{} splats are in one 16x16 tile, but the device takes {limit}; use fewer \
                          splats or backend cpu",
                         count.total
                     ),
@@ -321,7 +314,6 @@ fn sort_passes(tiles: u32, digit_bits: u32) -> u32 {
 }
 
 impl PairBins {
-    /// For at most `capacity` pairs and `tiles` tiles in a chunk.
     pub fn new(gpu: &Gpu, capacity: u32, tiles: u32) -> Result<Self> {
         let words = |n: u32| u64::from(n) * 4;
         let buffer = |label| gpu.bindable(label, words(capacity));
@@ -335,13 +327,12 @@ impl PairBins {
         })
     }
 
-    /// The splat of each pair in tile order, after a chunk of so many tiles was sorted: in the
-    /// buffer of keys that the sort's last pass has read and nothing needs any more.
+    /// The splat of each pair in tile order, in a buffer of keys that is free after the sort.
     pub fn splat_from_pair(&self, tiles: u32) -> &wgpu::Buffer {
         &self.keys[((sort_passes(tiles, self.digit_bits) + 1) % 2) as usize]
     }
 
-    /// Slots in tile order, after a chunk of so many tiles was sorted.
+    /// Slots in tile order after the sort of a chunk of `tiles` tiles.
     pub fn slot_from_pair(&self, tiles: u32) -> &wgpu::Buffer {
         &self.slots[(sort_passes(tiles, self.digit_bits) % 2) as usize]
     }

@@ -1,8 +1,8 @@
 //! depth_loss: relative difference of a picture's depth and a photo's, with its gradients.
 
 use super::device::{Gpu, Op};
+use super::kernels::Kernel;
 use super::layout::{DEPTH_GROUPS, DepthStep, View};
-use super::shaders::Kernel;
 use crate::error::Result;
 use crate::stages::{DepthLoss, Image};
 use crate::target::TargetDepth;
@@ -12,7 +12,7 @@ pub(super) fn depth_rows(target: &TargetDepth) -> Vec<[f32; 2]> {
     target.depths.iter().zip(&target.confidences).map(|(&z, &c)| [z, c]).collect()
 }
 
-/// What the kernel reads of a photo, and its sums, for pictures of one size.
+/// Copy of a photo's depths, and sums, for pictures of one size.
 #[derive(Debug)]
 pub(super) struct DepthBuffers {
     /// `[H * W]` depth and confidence.
@@ -21,28 +21,26 @@ pub(super) struct DepthBuffers {
     pub sums: wgpu::Buffer,
 }
 
-/// What the kernel reads and what it changes in place.
+/// Inputs of the kernel and buffers that it updates.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Compared<'a> {
     /// A [`View`].
     pub view: &'a wgpu::Buffer,
     /// A [`DepthStep`].
     pub uniform: &'a wgpu::Buffer,
-    /// `[H * W]` colour and transmittance.
+    /// `[H * W]` color and transmittance.
     pub picture: &'a wgpu::Buffer,
     /// `[H * W]` accumulated depth.
     pub depths: &'a wgpu::Buffer,
-    /// `[H * W]` gradients of colour and, from here on, accumulated depth.
+    /// `[H * W]` gradients of color and, from here on, accumulated depth.
     pub v_picture: &'a wgpu::Buffer,
     /// `[H * W]` as rasterize_backward reads them.
     pub totals: &'a wgpu::Buffer,
 }
 
 impl DepthBuffers {
-    /// Bytes of [`Self::sums`].
     pub const SUM_BYTES: u64 = DEPTH_GROUPS as u64 * 4;
 
-    /// For so many pixels.
     pub fn new(gpu: &Gpu, pixels: u64) -> Result<Self> {
         Ok(Self {
             photo: gpu.bindable("depths of a photo", 8 * pixels)?,
@@ -50,7 +48,7 @@ impl DepthBuffers {
         })
     }
 
-    /// Adds the loss's gradients to those of the picture.
+    /// Adds the loss's gradients to the picture's.
     pub fn op(&self, gpu: &Gpu, of: Compared<'_>) -> Op {
         let bindings = [
             of.view.into(),

@@ -1,16 +1,15 @@
-//! Keeps Vulkan from asking a desktop that is not there.
+//! Disables a Vulkan layer that prints an error on machines without a desktop.
 //!
-//! Mesa's layer `VK_LAYER_MESA_device_select` asks the Wayland compositor which GPU it uses. Where
-//! there is no compositor, libwayland prints "error: XDG_RUNTIME_DIR is invalid or not set in the
-//! environment." on stderr, once for each adapter query. Vulkan has no call that switches such a layer
-//! off; its manifest names the environment variable `NODEVICE_SELECT` for that.
+//! Mesa's layer `VK_LAYER_MESA_device_select` asks the Wayland compositor which GPU it uses; without one,
+//! libwayland prints an error for each adapter query. The layer's manifest names the environment variable
+//! `NODEVICE_SELECT` to disable it.
 
 use std::env;
 use std::path::Path;
 use std::sync::Once;
 
-/// Switches Mesa's layer off where Wayland cannot be reached, unless the user has set one of the
-/// variables that control it. Call this before Vulkan is loaded.
+/// Disables Mesa's layer if Wayland cannot be reached, unless the user has set one of the variables that
+/// control it. Call this before Vulkan is loaded.
 pub fn silence_device_select() {
     static ONCE: Once = Once::new();
     ONCE.call_once(|| {

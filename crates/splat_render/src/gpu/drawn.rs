@@ -1,11 +1,10 @@
-//! What a device's density controls share: sums over all splats, and splats that are drawn but not yet in
-//! the order of Morton's curve.
+//! Shared by the device's density controls: sums over all splats, and sorting the new splats.
 
 use bytemuck::{Pod, Zeroable};
 
 use super::bin::SplatBins;
 use super::device::{Gpu, Op};
-use super::shaders::Kernel;
+use super::kernels::Kernel;
 use crate::error::Result;
 use crate::fit_device::Cells;
 
@@ -15,7 +14,6 @@ const BOUNDS_GROUPS: u32 = 64;
 /// Floats per workgroup of density_rows.
 const ROW_FLOATS_PER_GROUP: u32 = 256;
 
-/// A scan.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub(super) struct Scan {
@@ -43,18 +41,17 @@ pub(super) struct Rows {
     pub unused: u32,
 }
 
-/// What a row of an array becomes.
+/// The result for a row of an array.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum RowKind {
     /// It is copied from its place in the drawn geometry.
     Geometry = 0,
-    /// It is copied from where its source was.
+    /// Copied from its source.
     Colors = 1,
     /// It is copied from there, or becomes zero.
     Moments = 2,
 }
 
-/// A buffer of whole numbers.
 pub(super) fn words(gpu: &Gpu, label: &str, count: u32) -> Result<wgpu::Buffer> {
     gpu.bindable(label, 4 * u64::from(count))
 }
@@ -79,7 +76,7 @@ impl Scans {
         })
     }
 
-    /// `[N]` `words` become their inclusive sums; the places of those that are zero go to `zeros`.
+    /// Replaces `[N]` `words` by their inclusive sums; `zeros` gets the indices of zero words.
     pub fn ops(
         &self,
         gpu: &Gpu,
@@ -105,14 +102,13 @@ impl Scans {
 pub(super) struct Drawn {
     /// `[N after * GEOMETRY]`
     pub geometry: wgpu::Buffer,
-    /// `[N after]` twice the row of a splat's colours and moments, and 1 where its moments are zero.
+    /// `[N after]` twice the row of a splat's colors and moments, plus 1 if its moments are zero.
     pub rows: wgpu::Buffer,
-    /// Splats after the run.
     pub splats: u32,
     pub cells: Cells,
 }
 
-/// The box of the first so many splats' centres, in parts.
+/// The bounding box of the first splats' centers, in parts.
 #[derive(Debug)]
 pub(super) struct Bounds {
     pub corners: wgpu::Buffer,
@@ -136,7 +132,7 @@ impl Bounds {
         Ok(Self { corners, op })
     }
 
-    /// The cells of the whole box, from what was read of `corners`.
+    /// The cells of the whole box, from the downloaded `corners`.
     pub fn cells(bytes: &[u8]) -> Cells {
         let corners: Vec<[f32; 6]> = bytemuck::pod_collect_to_vec(bytes);
         let (mut low, mut high) = ([f32::INFINITY; 3], [f32::NEG_INFINITY; 3]);

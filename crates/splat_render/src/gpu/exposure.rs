@@ -1,43 +1,41 @@
-//! exposure and exposure_backward: a picture's colours as a photo of some gain and offset has them.
+//! exposure and exposure_backward: a picture's colors as a photo of some gain and offset has them.
 
 use super::device::{Gpu, Op};
+use super::kernels::Kernel;
 use super::layout::{EXPOSURE_GROUPS, ExposureUniform, View};
-use super::shaders::Kernel;
 use crate::error::Result;
 use crate::stages::{Exposure, ExposureGradients, Image};
 
 /// Sums per workgroup: the gradients of gain and offset.
 const SUMS: usize = 6;
 
-/// What the kernels write, for pictures of one size.
+/// Outputs of the kernels, for pictures of one size.
 #[derive(Debug)]
 pub(super) struct ExposureBuffers {
-    /// `[H * W]` corrected colour and transmittance.
+    /// `[H * W]` corrected color and transmittance.
     pub corrected: wgpu::Buffer,
     /// `[EXPOSURE_GROUPS * SUMS]`
     pub sums: wgpu::Buffer,
 }
 
-/// What the kernels read and what they change in place.
+/// Inputs of the kernels and buffers that they update.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Exposed<'a> {
     /// A [`View`].
     pub view: &'a wgpu::Buffer,
     /// An [`ExposureUniform`].
     pub uniform: &'a wgpu::Buffer,
-    /// `[H * W]` colour and transmittance.
+    /// `[H * W]` color and transmittance.
     pub picture: &'a wgpu::Buffer,
-    /// `[H * W]` gradients of the corrected colours, then of the picture's.
+    /// `[H * W]` gradients of the corrected colors, then of the picture's.
     pub v_picture: &'a wgpu::Buffer,
     /// `[H * W]` as rasterize_backward reads them.
     pub totals: &'a wgpu::Buffer,
 }
 
 impl ExposureBuffers {
-    /// Bytes of [`Self::sums`].
     pub const SUM_BYTES: u64 = EXPOSURE_GROUPS as u64 * SUMS as u64 * 4;
 
-    /// For so many pixels.
     pub fn new(gpu: &Gpu, pixels: u64) -> Result<Self> {
         Ok(Self {
             corrected: gpu.bindable("corrected picture", 16 * pixels)?,
@@ -58,12 +56,11 @@ impl ExposureBuffers {
         gpu.op(kernel, &bindings, [EXPOSURE_GROUPS, 1])
     }
 
-    /// Corrects the picture.
     pub fn forward(&self, gpu: &Gpu, of: Exposed<'_>) -> Op {
         self.op(gpu, Kernel::Exposure, of)
     }
 
-    /// Turns gradients of the corrected colours into those of the picture, and adds up the others.
+    /// Computes the picture's gradients, and sums those for gain and offset.
     pub fn backward(&self, gpu: &Gpu, of: Exposed<'_>) -> Op {
         self.op(gpu, Kernel::ExposureBackward, of)
     }

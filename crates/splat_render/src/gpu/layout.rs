@@ -1,5 +1,4 @@
-//! Structs shared with WGSL (`shaders/shared.wgsl`) and the row lengths of the flat buffers. A test holds
-//! offsets and sizes against naga's reflection of the shaders.
+//! Structs shared with WGSL, and the row lengths of flat buffers. A test checks them with naga.
 
 use std::ops::Range;
 
@@ -15,7 +14,7 @@ use crate::target::Weight;
 pub(super) const GEOMETRY: usize = 11;
 
 /// Floats per splat or slot in a buffer of 2D gradients: mean 2 (moments of order 1 in a slot),
-/// factor 3 (order 2), depth, colour 3, opacity.
+/// factor 3 (order 2), depth, color 3, opacity.
 pub(super) const GRADIENT: usize = 10;
 
 /// The same with the absolute gradient of the mean, 2 floats, behind it.
@@ -24,10 +23,9 @@ pub(super) const GRADIENT_ABSOLUTE: usize = GRADIENT + 2;
 /// Floats of a camera's gradient: rows of the 3x4 viewmat, fx, fy, cx, cy.
 pub(super) const CAMERA: usize = 16;
 
-/// Words per splat of what a fit notes beside parameters and moments, and where in them lie: the sum of
-/// gradient lengths and the steps seen, as floats, which density control watches; twice the first of the
-/// steps that its colours wait for, and 1 more where that one has a gradient; and that gradient, as
-/// floats, of the colour 3 and the direction it was seen along 3.
+/// Words per splat of a fit's notes, with their offsets: gradient sum and steps seen (floats), for
+/// density control; twice the first step that colors wait for, plus 1 if it has a gradient; that gradient
+/// of the color and its viewing direction (3 floats each).
 pub(super) const NOTES: usize = 9;
 pub(super) const NOTE_PULL: usize = 0;
 pub(super) const NOTE_SEEN: usize = 1;
@@ -35,17 +33,16 @@ pub(super) const NOTE_WAITS: usize = 2;
 pub(super) const NOTE_COLOR: usize = 3;
 pub(super) const NOTE_DIRECTION: usize = 6;
 
-/// Splats per workgroup of the per-splat kernels; windows are multiples of it, which also keeps
-/// every per-splat buffer's offset a multiple of 256 bytes.
+/// Splats per workgroup and unit of windows, which keeps buffer offsets multiples of 256 bytes.
 pub(super) const SPLATS_PER_GROUP: u32 = 64;
 
-/// Workgroups of the exposure kernels, each with sums of its own.
+/// Workgroups of the exposure kernels; each has separate sums.
 pub(super) const EXPOSURE_GROUPS: u32 = 64;
 
-/// Workgroups of the depth loss, each with a sum of its own.
+/// Workgroups of the depth loss; each has a separate sum.
 pub(super) const DEPTH_GROUPS: u32 = 64;
 
-/// Camera, background and how colours and parameters are stored.
+/// Camera, background and how colors and parameters are stored.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub(super) struct View {
@@ -70,12 +67,12 @@ pub(super) struct View {
 }
 
 impl View {
-    /// What the rasterize stages need.
+    /// The fields that the rasterize stages read.
     pub fn of_picture(width: u32, height: u32, background: [f32; 3]) -> Self {
         Self { background, width, height, tiles_x: width.div_ceil(TILE), ..Self::zeroed() }
     }
 
-    /// What the project stages need for these splats.
+    /// The fields that the project stages read.
     pub fn of_camera(
         camera: &Camera,
         options: &ProjectOptions,
@@ -93,7 +90,6 @@ impl View {
         }
     }
 
-    /// Camera and background alone.
     pub fn of_view(camera: &Camera, options: &ProjectOptions, background: [f32; 3]) -> Self {
         let row = |i: usize| camera.viewmat.row(i).to_array().map(|v| v as f32);
         Self {
@@ -111,7 +107,6 @@ impl View {
     }
 }
 
-/// The splats of one dispatch.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 pub(super) struct Window {
@@ -120,7 +115,7 @@ pub(super) struct Window {
     pub groups_max: u32,
 }
 
-/// The tiles of one dispatch and where their pairs are counted.
+/// The tiles of one dispatch and the index of their counts.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 pub(super) struct Chunk {
@@ -166,7 +161,6 @@ impl Chunk {
     }
 }
 
-/// One pass of the radix sort.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 pub(super) struct SortPass {
@@ -200,7 +194,7 @@ pub(super) struct ChunkCount {
     pub total: u32,
 }
 
-/// What precedes the chunk counts in the status buffer.
+/// Start of the status buffer, before the counts of chunks.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 pub(super) struct StatusHead {
@@ -210,14 +204,13 @@ pub(super) struct StatusHead {
     pub visible: u32,
 }
 
-/// What the depth of a photo counts in a step.
+/// Weight of one depth of the photo in a step.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub(super) struct DepthStep {
     pub scale: f32,
 }
 
-/// What a photo's exposure does to a picture.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub(super) struct ExposureUniform {
@@ -239,7 +232,7 @@ impl From<&Exposure<f32>> for ExposureUniform {
     }
 }
 
-/// The steps that colours may wait for.
+/// The steps that colors may wait for.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub(super) struct ColorSteps {
@@ -250,7 +243,7 @@ pub(super) struct ColorSteps {
 }
 
 impl ColorSteps {
-    /// Where step `at` lies, and what it holds.
+    /// Offset and value of step `at`.
     pub fn entry(at: usize, step: &ColorStep) -> (u64, [f32; 4]) {
         let offset = std::mem::offset_of!(Self, steps) + 16 * at;
         let [bias_first, bias_second] = step.bias;
@@ -258,7 +251,7 @@ impl ColorSteps {
     }
 }
 
-/// What one step of a fit is to do.
+/// Settings of one step of a fit.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub(super) struct Step {
@@ -282,7 +275,7 @@ pub(super) struct Step {
 }
 
 impl Step {
-    /// What adam is to do to the first `moving` splats.
+    /// An adam step of the first `moving` splats.
     pub fn of_adam(step: &AdamStep, moving: u32) -> Self {
         let n = f64::from(moving.max(1));
         let Rates { means, quats, scales, opacities, sh0, sh_rest } = step.rates;
@@ -306,7 +299,7 @@ impl Step {
         }
     }
 
-    /// The same, with what the loss is told of a photo.
+    /// Adds the settings of the loss.
     pub fn with_loss(self, ssim_weight: f32, weight: Weight, has_weights: bool) -> Self {
         let (ssim, scale) = (f64::from(ssim_weight), weight.scale());
         Self {

@@ -4,45 +4,42 @@ use bytemuck::Zeroable;
 
 use super::bin::tile_count;
 use super::device::{Gpu, Op};
+use super::kernels::Kernel;
 use super::layout::{Step, View};
-use super::shaders::Kernel;
 use crate::constants::TILE;
 use crate::error::Result;
 use crate::stages::{Image, Loss};
 use crate::target::Target;
 
-/// Rows or columns of a workgroup, where the loss goes along them.
+/// Rows or columns per workgroup of the loss by lines.
 const LINES_PER_GROUP: u32 = 8;
 
-/// A photo's pixels as the kernels read them: opaque where it has no alpha.
+/// A photo's pixels in the kernels' layout; opaque without alpha.
 pub(super) fn rgba(target: &Target) -> Vec<[u8; 4]> {
     let pixels = target.pixels.chunks_exact(target.channels as usize);
     pixels.map(|p| [p[0], p[1], p[2], p.get(3).copied().unwrap_or(255)]).collect()
 }
 
-/// What the loss reads and writes for pictures of one size.
+/// Buffers of the loss for pictures of one size.
 #[derive(Debug)]
 pub(super) struct LossBuffers {
     /// `[H * W]` RGBA bytes.
     pub photo: wgpu::Buffer,
     /// `[H * W]`
     pub weights: wgpu::Buffer,
-    /// `[9 * H * W]` slopes of SSIM; `[H * W * 12]` what goes from pass to pass where they go along lines.
+    /// `[9 * H * W]` slopes of SSIM; `[12 * H * W]` intermediate data of the loss by lines.
     slopes: wgpu::Buffer,
-    /// `[H * W]` gradients of colour and, 0, accumulated depth.
+    /// `[H * W]` gradients of color and, 0, accumulated depth.
     pub v_picture: wgpu::Buffer,
-    /// `[H * W]` colour . v_color.
+    /// `[H * W]` color . v_color.
     pub totals: wgpu::Buffer,
     /// `[parts * 2]` weighted sums of SSIM and of |x - y|.
     pub sums: wgpu::Buffer,
-    /// Width and height.
     size: [u32; 2],
-    /// Entries of `sums`.
     parts: u32,
 }
 
 impl LossBuffers {
-    /// For pictures of one size.
     pub fn new(gpu: &Gpu, width: u32, height: u32) -> Result<Self> {
         let pixels = u64::from(width) * u64::from(height);
         let (parts, planes) = if gpu.loss_by_lines() {
@@ -62,7 +59,6 @@ impl LossBuffers {
         })
     }
 
-    /// Bytes of [`Self::sums`].
     pub fn sum_bytes(&self) -> u64 {
         8 * u64::from(self.parts)
     }
@@ -78,7 +74,6 @@ impl LossBuffers {
         total
     }
 
-    /// All passes.
     pub fn ops(
         &self,
         gpu: &Gpu,

@@ -1,18 +1,16 @@
-//! MCMC's density control on the device, with the bits of `fit_device::mcmc`: dead splats move to living
-//! ones, fresh ones are added, and all are put in the order of Morton's curve. The host learns the
-//! centres of a sample, what the weights add up to, and the bounding box.
+//! MCMC's density control on the device, with the bits of `fit_device::mcmc`. The host reads the centers
+//! of a sample, the sum of the weights, and the bounding box.
 
 use bytemuck::{Pod, Zeroable};
 use rayon::prelude::*;
 
 use super::device::{Bound, Gpu, Op};
 use super::drawn::{Bounds, Drawn, Scans, words};
+use super::kernels::Kernel;
 use super::layout::GEOMETRY;
-use super::shaders::Kernel;
 use crate::error::Result;
 use crate::fit_device::{FogCamera, McmcRun, sampled_every, share_table, weight_table};
 
-/// What the kernels are told of a round.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub(super) struct Run {
@@ -32,7 +30,7 @@ pub(super) fn shares(gpu: &Gpu) -> Result<wgpu::Buffer> {
     gpu.upload("shares", share_table())
 }
 
-/// Draws what `run` moves and adds; `geometry` and `colors` of `n` splats are only read.
+/// Makes the moved and added splats of `run`; `geometry` and `colors` of `n` splats are only read.
 pub(super) fn draw(
     gpu: &Gpu,
     (geometry, colors): (&wgpu::Buffer, &wgpu::Buffer),
@@ -68,9 +66,9 @@ pub(super) fn draw(
     };
     let samples = n.div_ceil(every);
     let sample = words("sample", 3 * samples)?;
-    // Bound and not read where only centres are asked for.
+    // Bound, but not read if only centers are requested.
     let none = gpu.buffer("cameras", size_of::<FogCamera>() as u64)?;
-    let centres: Vec<[f32; 3]> = if run.cameras.is_empty() {
+    let centers: Vec<[f32; 3]> = if run.cameras.is_empty() {
         gpu.submit(&[&[copy]])?;
         Vec::new()
     } else {
@@ -80,7 +78,7 @@ pub(super) fn draw(
         bytemuck::pod_collect_to_vec(&data[0])
     };
     let fog: Vec<FogCamera> =
-        run.cameras.par_iter().map(|camera| FogCamera::new(camera, &centres)).collect();
+        run.cameras.par_iter().map(|camera| FogCamera::new(camera, &centers)).collect();
     let cameras = if fog.is_empty() { none } else { gpu.upload("cameras", &fog)? };
 
     let copies = words("copies", n + fresh)?;
@@ -117,7 +115,7 @@ pub(super) fn draw(
             spread(Kernel::McmcCopy, round, targets),
         ]);
     }
-    // Fresh splats lie where their sources do.
+    // Added splats have their sources' centers.
     let Bounds { corners, op } = Bounds::new(gpu, &drawn, n, &rows)?;
     ops.push(op);
     let data =

@@ -1,6 +1,5 @@
-//! The original density control on the device, with the bits of `fit_device::original`: splats are cloned,
-//! split and pruned, and all are put in the order of Morton's curve. The host learns how many stay and
-//! grow, and the bounding box.
+//! The original density control on the device, with the bits of `fit_device::original`. The host reads
+//! the numbers of splats that stay and grow, and the bounding box.
 
 use bytemuck::{Pod, Zeroable};
 
@@ -8,13 +7,12 @@ use super::adam::AdamBuffers;
 use super::bin::SplatBins;
 use super::device::{Bound, Gpu, Op};
 use super::drawn::{Bounds, Drawn, Scans, words};
+use super::kernels::Kernel;
 use super::layout::{GEOMETRY, SPLATS_PER_GROUP};
 use super::project::{count, window_uniform};
-use super::shaders::Kernel;
 use crate::error::Result;
 use crate::fit_device::OriginalRun;
 
-/// What the kernels are told of a run.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub(super) struct RunUniform {
@@ -29,18 +27,18 @@ pub(super) struct RunUniform {
     pub zero: u32,
 }
 
-/// A run: what becomes of each splat.
+/// A run: the choice of splats that stay and grow.
 #[derive(Debug)]
 pub(super) struct Choice<'a> {
     adam: &'a AdamBuffers,
-    /// Those of the scene as it was, for a sort; no step needs what is in them.
+    /// Bins of the scene before the run, reused for a sort; no step needs their contents.
     bins: &'a SplatBins,
     run: RunUniform,
     uniform: wgpu::Buffer,
-    /// What is told of each splat (original_run.wgsl).
-    told: wgpu::Buffer,
+    /// Flags of each splat (original_run.wgsl).
+    flags: wgpu::Buffer,
     growing: wgpu::Buffer,
-    /// Splats that stay, and those of them that grow, rising.
+    /// Indices of splats that stay, and of staying splats that grow, ascending.
     lists: [wgpu::Buffer; 2],
     scans: Scans,
 }
@@ -69,7 +67,7 @@ impl<'a> Choice<'a> {
             bins,
             run,
             uniform: gpu.uniform(&run),
-            told: words(gpu, "told of splats", n)?,
+            flags: words(gpu, "flags of splats", n)?,
             growing: words(gpu, "growing", n)?,
             lists: [words(gpu, "staying splats", n)?, words(gpu, "growing splats", n)?],
             scans: Scans::new(gpu, n)?,
@@ -86,13 +84,13 @@ impl<'a> Choice<'a> {
             self.bins.keys().into(),
             self.bins.order().into(),
             (&self.bins.status).into(),
-            (&self.told).into(),
+            (&self.flags).into(),
             (&self.growing).into(),
         ];
         gpu.op(kernel, &bindings, gpu.groups(self.run.splats, SPLATS_PER_GROUP))
     }
 
-    /// Tells which splats grow.
+    /// Marks the splats that grow.
     pub fn grow_ops(&self, gpu: &Gpu) -> Vec<Op> {
         let mut ops = vec![self.choose_op(gpu, Kernel::OriginalPull, &self.uniform)];
         ops.extend(self.bins.depth_ops(gpu, false));
@@ -100,7 +98,7 @@ impl<'a> Choice<'a> {
         ops
     }
 
-    /// Lists those that stay, or all, and those of them that grow.
+    /// Lists the splats that stay (all if `keeps_all`), and the growing ones among them.
     pub fn list_ops(&self, gpu: &Gpu, keeps_all: bool) -> Vec<Op> {
         let uniform = gpu.uniform(&RunUniform { keeps_all: u32::from(keeps_all), ..self.run });
         let mut ops = vec![self.choose_op(gpu, Kernel::OriginalKeep, &uniform)];
@@ -125,7 +123,7 @@ impl<'a> Choice<'a> {
         let bindings = [
             (&self.uniform).into(),
             (&self.adam.splats.geometry).into(),
-            (&self.told).into(),
+            (&self.flags).into(),
             staying.into(),
             growing.into(),
             (&self.scans.totals).into(),
@@ -149,14 +147,14 @@ pub(super) struct Halfway {
 }
 
 impl Halfway {
-    /// With the cells of the box, from what was read of its corners.
+    /// Adds the cells of the box, from the downloaded corners.
     pub fn ordered(self, corners: &[u8]) -> Drawn {
         let Self { geometry, rows, splats, .. } = self;
         Drawn { geometry, rows, splats, cells: Bounds::cells(corners) }
     }
 }
 
-/// Draws what becomes of all splats; None where that is more than `binds` takes.
+/// Makes the splats of a run; None if the result does not fit `binds`.
 pub(super) fn draw(
     gpu: &Gpu,
     (adam, bins): (&AdamBuffers, &SplatBins),
@@ -168,7 +166,7 @@ pub(super) fn draw(
     ops.extend(choice.list_ops(gpu, false));
     let splats = match choice.splats(gpu, &ops)? {
         Some(splats) => splats,
-        // A fit without splats cannot recover: keep what there is.
+        // A fit without splats cannot recover: keep all.
         None => choice.splats(gpu, &choice.list_ops(gpu, true))?.unwrap_or(0),
     };
     if !binds(splats) {

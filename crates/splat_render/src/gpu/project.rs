@@ -3,8 +3,8 @@
 use std::ops::Range;
 
 use super::device::{Bound, Gpu, Op};
+use super::kernels::Kernel;
 use super::layout::{GEOMETRY, GRADIENT, SPLATS_PER_GROUP, Splat2d, View, Window};
-use super::shaders::Kernel;
 use crate::camera::Camera;
 use crate::error::{Error, Result};
 use crate::stages::{Colors, ProjectOptions, Projected, SplatParams};
@@ -12,9 +12,7 @@ use crate::stages::{Colors, ProjectOptions, Projected, SplatParams};
 /// Splat parameters on the device.
 #[derive(Debug)]
 pub(super) struct SplatBuffers {
-    /// Number of splats.
     pub splats: u32,
-    /// Floats of colour per splat.
     pub color_floats: u64,
     /// `[N * GEOMETRY]`
     pub geometry: wgpu::Buffer,
@@ -22,7 +20,7 @@ pub(super) struct SplatBuffers {
     pub colors: wgpu::Buffer,
 }
 
-/// A camera and the 2D splats it sees, on the device: what all stages after project read.
+/// A camera and its 2D splats on the device, input of all stages after project.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Projection<'a> {
     /// A [`View`].
@@ -36,13 +34,12 @@ pub(super) const SPLAT_2D: usize = size_of::<Splat2d>() / 4;
 
 /// The number of splats as the kernels count them.
 pub(super) fn count(splats: usize) -> Result<u32> {
-    // Far above what fits any device, and low enough that no index overflows.
+    // Above the memory of any device, and low enough that no index overflows.
     u32::try_from(splats).ok().filter(|&n| n < 1 << 26).ok_or_else(|| {
         Error::argument("means", format!("has {splats} rows; backend gpu takes at most 67 million"))
     })
 }
 
-/// Rows of the geometry buffer.
 pub(super) fn geometry_rows(splats: &SplatParams<'_, f32>) -> Vec<[f32; GEOMETRY]> {
     (0..splats.len())
         .map(|i| {
@@ -57,7 +54,6 @@ pub(super) fn geometry_rows(splats: &SplatParams<'_, f32>) -> Vec<[f32; GEOMETRY
 }
 
 impl SplatBuffers {
-    /// Copies the parameters to the device.
     pub fn upload(gpu: &Gpu, splats: &SplatParams<'_, f32>) -> Result<Self> {
         let (stride, colors) = match splats.colors {
             Colors::Direct(colors) => (1, colors),
@@ -71,7 +67,7 @@ impl SplatBuffers {
         })
     }
 
-    /// Room for so many splats, of which nothing is known yet.
+    /// Uninitialized buffers for `splats` splats.
     pub fn new(gpu: &Gpu, splats: u32, color_floats: u64) -> Result<Self> {
         let rows = |floats: u64| u64::from(splats) * floats * 4;
         Ok(Self {

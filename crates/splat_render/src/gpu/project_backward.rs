@@ -1,10 +1,10 @@
 //! project_backward: gradients of the 2D splats to gradients of the splats and the camera.
 
 use super::device::{Gpu, Op};
+use super::kernels::Kernel;
 use super::layout::{CAMERA, GEOMETRY, GRADIENT, SPLATS_PER_GROUP, View};
 use super::project::{Projection, SPLAT_2D, SplatBuffers, geometry_rows, rows, window_uniform};
 use super::rasterize::splats2d;
-use super::shaders::Kernel;
 use crate::camera::Camera;
 use crate::error::Result;
 use crate::stages::{
@@ -16,8 +16,7 @@ pub(super) fn camera_sums(splats: u32) -> u32 {
     splats.div_ceil(SPLATS_PER_GROUP)
 }
 
-/// Gradients of viewmat and intrinsics from the sums of all workgroups, which are few enough to be
-/// added in f64, in their order.
+/// Gradients of viewmat and intrinsics from the workgroups' sums, added in f64 in order.
 pub(super) fn camera_sum(sums: &[u8]) -> ([[f64; 4]; 3], [f64; 4]) {
     let mut total = [0.0f64; CAMERA];
     for row in sums.chunks_exact(CAMERA * 4) {
@@ -43,13 +42,12 @@ pub(super) struct GradientBuffers {
     pub camera: wgpu::Buffer,
 }
 
-/// Sums of the camera's gradients, for so many splats.
+/// Partial sums of the camera's gradients for `splats` splats.
 pub(super) fn camera_buffer(gpu: &Gpu, splats: u32) -> Result<wgpu::Buffer> {
     gpu.bindable("v_camera", u64::from(camera_sums(splats)) * CAMERA as u64 * 4)
 }
 
 impl GradientBuffers {
-    /// For these splats.
     pub fn new(gpu: &Gpu, splats: &SplatBuffers) -> Result<Self> {
         let n = u64::from(splats.splats);
         Ok(Self {
@@ -79,7 +77,6 @@ impl GradientBuffers {
     }
 }
 
-/// Differentiates the projection of all splats.
 pub(super) fn project_backward_ops(
     gpu: &Gpu,
     drawn: Projection<'_>,
@@ -110,7 +107,6 @@ pub(super) fn project_backward_ops(
     ops
 }
 
-/// Rows of a 2D gradient buffer.
 fn gradient_rows(v: &ProjectedGradients<f32>) -> Vec<[f32; GRADIENT]> {
     (0..v.v_means2d.len())
         .map(|i| {

@@ -4,13 +4,13 @@ use bytemuck::Zeroable;
 
 use super::bin::{PairBins, SplatBins, TileChunk, tile_count};
 use super::device::{Gpu, Op};
+use super::kernels::Kernel;
 use super::layout::{Chunk, GRADIENT, Splat2d, View};
 use super::project::{Projection, count};
-use super::shaders::Kernel;
 use crate::error::Result;
 use crate::stages::{Image, Projected};
 
-/// 2D splats as the kernels read them; those that are not drawn are culled.
+/// 2D splats in the kernels' layout; splats that are not drawn become culled ones.
 pub(super) fn splats2d(projected: &Projected<f32>) -> Vec<Splat2d> {
     (0..projected.len())
         .map(|i| {
@@ -31,7 +31,7 @@ pub(super) fn splats2d(projected: &Projected<f32>) -> Vec<Splat2d> {
         .collect()
 }
 
-/// Binned 2D splats: what both directions of the stage begin with.
+/// Binned 2D splats, input of both directions of the stage.
 pub(super) struct Binned {
     pub view: wgpu::Buffer,
     pub splats2d: wgpu::Buffer,
@@ -43,8 +43,7 @@ pub(super) struct Binned {
 }
 
 impl Binned {
-    /// Uploads the splats, sorts them by depth and cuts the tiles into chunks that fit, also with
-    /// so many floats per pair.
+    /// Uploads and sorts the splats and cuts the tiles into chunks, at `slot_floats` floats per pair.
     pub fn new(
         gpu: &Gpu,
         projected: &Projected<f32>,
@@ -72,7 +71,6 @@ impl Binned {
         Projection { view: &self.view, splats2d: &self.splats2d }
     }
 
-    /// Fills the pair lists for a chunk.
     pub fn chunk_ops(&self, gpu: &Gpu, chunk: &TileChunk) -> Vec<Op> {
         let mut ops = self.bins.count_ops(gpu, self.projection(), chunk);
         ops.extend(self.bins.pair_ops(gpu, self.projection(), chunk, &self.pairs));
@@ -80,17 +78,15 @@ impl Binned {
     }
 }
 
-/// A picture on the device.
 #[derive(Debug)]
 pub(super) struct PictureBuffers {
-    /// `[H * W]` colour and final transmittance.
+    /// `[H * W]` color and final transmittance.
     pub picture: wgpu::Buffer,
     /// `[H * W]` accumulated depths.
     pub depths: wgpu::Buffer,
 }
 
 impl PictureBuffers {
-    /// For so many pixels.
     pub fn new(gpu: &Gpu, pixels: u64) -> Result<Self> {
         Ok(Self {
             picture: gpu.bindable("picture", 16 * pixels)?,

@@ -2,19 +2,19 @@
 
 use super::bin::{PairBins, SplatBins, TileChunk};
 use super::device::{Gpu, Op};
+use super::kernels::Kernel;
 use super::layout::{GRADIENT, GRADIENT_ABSOLUTE};
 use super::project::Projection;
 use super::rasterize::Binned;
-use super::shaders::Kernel;
 use crate::error::Result;
 use crate::stages::{Image, ImageGradients, Projected, ProjectedGradients};
 
-/// What the kernels read and write.
+/// Buffers of the kernels.
 #[derive(Debug)]
 pub(super) struct BackwardBuffers {
-    /// `[H * W]` gradients of colour and accumulated depth.
+    /// `[H * W]` gradients of color and accumulated depth.
     pub v_picture: wgpu::Buffer,
-    /// `[H * W]` colour . v_color + depth v_depth - transmittance v_alpha.
+    /// `[H * W]` color . v_color + depth v_depth - transmittance v_alpha.
     pub totals: wgpu::Buffer,
     /// `[H * W]`, for lists that take more than one dispatch.
     pub transmittances: wgpu::Buffer,

@@ -16,7 +16,7 @@ pub struct ResidentView<'a> {
     pub camera: &'a Camera,
     /// Settings of the project stage.
     pub options: &'a ProjectOptions,
-    /// Highest SH degree that is evaluated; at most what was given is.
+    /// Highest SH degree to evaluate, capped at the stored one.
     pub sh_degree: u32,
 }
 
@@ -57,7 +57,7 @@ impl ResidentSplats {
         };
         Ok(Self {
             project: project_ops(gpu, drawn, &buffers, bins.keys()),
-            // Whoever draws by the order does not know how many are culled.
+            // Callers that draw in this order cannot know how many splats are culled.
             sort: bins.depth_ops(gpu, true),
             sh_degree,
             sh_stride,
@@ -79,11 +79,7 @@ impl ResidentSplats {
         self.len() == 0
     }
 
-    /// Records the project stage and the sort by depth, each a pass with its timestamps. One view per
-    /// submission: the last one given counts for all of it.
-    ///
-    /// # Errors
-    /// [`crate::Error::Argument`] if camera or options cannot be used.
+    /// Records project and sort, a pass with timestamps each. Only one view per submission.
     pub fn record(
         &self,
         gpu: &Gpu,
@@ -101,7 +97,7 @@ impl ResidentSplats {
         Projection { view: &self.view, splats2d: &self.splats2d }
     }
 
-    /// What the kernels are told of a view.
+    /// Uniforms of a view.
     pub(super) fn view(&self, view: &ResidentView<'_>) -> View {
         View {
             sh_degree: view.sh_degree.min(self.sh_degree),
@@ -111,7 +107,7 @@ impl ResidentSplats {
         }
     }
 
-    /// [`Self::record`] with what the kernels are told.
+    /// [`Self::record`] with given uniforms.
     pub(super) fn record_view(
         &self,
         gpu: &Gpu,

@@ -1,6 +1,5 @@
-//! Pictures that stay on the device: resident splats, binned and rasterized for one camera after
-//! another. Of each, only the number of (splat, tile) pairs is read back: it decides how much room
-//! they need.
+//! Pictures on the device: resident splats, binned and rasterized for one camera after another. The host
+//! reads back only the number of (splat, tile) pairs.
 
 use std::ops::Range;
 
@@ -12,7 +11,7 @@ use super::resident::{ResidentSplats, ResidentView};
 use crate::constants::TILE;
 use crate::error::{Error, Result};
 
-/// A picture on the device, with room for what lies between it and the splats.
+/// A picture on the device, with the buffers of its stages.
 #[derive(Debug)]
 pub struct ResidentPicture {
     width: u32,
@@ -25,7 +24,7 @@ pub struct ResidentPicture {
 }
 
 impl ResidentPicture {
-    /// For pictures of so many pixels or fewer.
+    /// For pictures of at most `width` x `height` pixels.
     pub fn new(gpu: &Gpu, width: u32, height: u32) -> Result<Self> {
         let pixels = u64::from(width) * u64::from(height);
         Ok(Self {
@@ -38,15 +37,14 @@ impl ResidentPicture {
         })
     }
 
-    /// `[H * W]` colour without background, and final transmittance, row-major.
+    /// `[H * W]` color without background, and final transmittance, row-major.
     pub fn picture(&self) -> &wgpu::Buffer {
         &self.buffers.picture
     }
 
-    /// Draws the columns of what a camera sees: submits project, sort and a count of the pairs, waits
-    /// for the count, and records to `encoder` what is left to do. The stages project, sort, bin and
-    /// rasterize each have their timestamps, of their last pass; where the pairs of all tiles do not fit
-    /// one binding, rasterize has the bin stages of later parts in it.
+    /// Draws the columns of a camera's picture: submits project, sort and a count of the pairs, waits for
+    /// the count, and records the rest to `encoder`. Each stage gets the timestamps of its last pass; if
+    /// the pairs exceed one binding, rasterize includes later parts' bin stages.
     pub fn record(
         &mut self,
         gpu: &Gpu,
@@ -66,8 +64,7 @@ impl ResidentPicture {
             return Err(Error::argument(
                 "columns",
                 format!(
-                    "{columns:?} of a picture of {}x{} are none or more than there is room for, \
-                     {}x{}",
+                    "{columns:?} of a picture of {}x{} are empty or larger than the room for {}x{}",
                     camera.width, camera.height, self.width, self.height
                 ),
             ));

@@ -1,17 +1,16 @@
-//! Colours that wait (`fit_device::waiting`): a fit's project brings those of splats that it sees up to
-//! date before it evaluates them, and another kernel those of all.
+//! Colors that wait (`fit_device::waiting`): in fits, project updates visible ones before use.
 
 use std::ops::Range;
 
 use super::adam::AdamBuffers;
 use super::bin::SplatBins;
 use super::device::{Gpu, Op};
+use super::kernels::Kernel;
 use super::layout::{GEOMETRY, NOTES, SPLATS_PER_GROUP};
 use super::project::{Projection, SPLAT_2D, rows, window_uniform};
-use super::shaders::Kernel;
 
 impl AdamBuffers {
-    /// Projects all splats, those that are seen with colours that are up to date; `steps` is a
+    /// Projects all splats and updates visible colors; `steps` is a
     /// [`ColorSteps`](super::layout::ColorSteps).
     pub fn project_ops(
         &self,
@@ -23,7 +22,7 @@ impl AdamBuffers {
         self.color_kernel(gpu, Kernel::FitProject, to, bins, steps)
     }
 
-    /// Brings all colours up to date. The SH degree in use is that of the view.
+    /// Brings all colors up to date, in the SH degree of the view.
     pub fn catch_up_ops(
         &self,
         gpu: &Gpu,

@@ -1,4 +1,4 @@
-//! GPUs that are known to compute right: the self-test, and where its verdict is remembered.
+//! GPUs that are known to compute correctly: the self-test, and the record of its verdict.
 
 mod self_test;
 mod verdict;

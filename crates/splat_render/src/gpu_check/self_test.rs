@@ -1,6 +1,6 @@
-//! Whether a device computes what it should: all kernels are compiled, and a small scene goes through
-//! every stage there and in the reference. A driver's compiler may refuse a kernel or get it wrong, and
-//! a fit that is wrong from the start shows in no message.
+//! Self-test of a device: compiles all kernels and compares every stage on a small scene with the
+//! reference. A driver's compiler may refuse or miscompile a kernel, and a fit with wrong values fails
+//! silently.
 
 use std::sync::Arc;
 
@@ -20,8 +20,7 @@ use crate::stages::{
 };
 use crate::target::{Target, TargetDepth};
 
-/// Largest difference from the reference, as a part of the largest value: f32 rounds to a hundredth of
-/// it, and a compiler's mistake is no matter of digits.
+/// Maximum relative difference from the reference: a hundred times f32's rounding.
 const TOLERANCE: f64 = 1e-3;
 /// Of the scene: one whose decisions are clear (a test has how).
 const SEED: u32 = 97;
@@ -29,14 +28,10 @@ const SPLATS: usize = 40;
 const SIZE: (u32, u32) = (56, 40);
 const BACKGROUND: [f64; 3] = [0.25, 0.5, 0.75];
 
-/// What a stage gives, as plain numbers.
+/// Outputs of a stage as plain numbers.
 type Outputs = Vec<(&'static str, Vec<f64>)>;
 
-/// Compiles every kernel and compares what they compute of a small scene with the reference, and a step
-/// and runs of density control of a fit with the CPU's.
-///
-/// # Errors
-/// [`Error::Device`] with what the driver says, or with the first stage that is wrong.
+/// Compiles every kernel and compares all stages and a fit on a small scene with reference and CPU.
 pub fn self_test(gpu: &Arc<Gpu>) -> Result<()> {
     gpu.compile_all()?;
     let mut outputs = all_stages::<f32>(&**gpu)?;
@@ -113,23 +108,11 @@ fn camera() -> Camera {
 }
 
 fn photo() -> Target {
-    Target {
-        width: SIZE.0,
-        height: SIZE.1,
-        channels: 3,
-        pixels: (0..3 * SIZE.0 as usize * SIZE.1 as usize)
-            .map(|k| (255.0 * draw(k)) as u8)
-            .collect(),
-        weights: None,
-        depth: None,
-        background: None,
-        turns: 1,
-        until: None,
-    }
+    let values = 3 * SIZE.0 as usize * SIZE.1 as usize;
+    Target::new(SIZE.0, SIZE.1, 3, (0..values).map(|k| (255.0 * draw(k)) as u8).collect())
 }
 
-/// Depths a third before and behind those of the scene, where its alpha is clearly above or below
-/// what has a depth.
+/// Depths a third off the scene's, at pixels whose alpha is clearly above or below the threshold.
 fn depths() -> Result<TargetDepth> {
     let options = ProjectOptions { antialiased: true, ..ProjectOptions::default() };
     let projected = Reference.project(&scene::<f64>().params(2), &camera(), &options)?;
@@ -233,27 +216,20 @@ fn a_fit(device: &mut dyn FitDevice) -> Result<Outputs> {
     device.upload(begin.clone())?;
     let AdamStep { rates, sh_degree, opacity_regularizer, scale_regularizer, .. } = adam_step();
     let input = StepInput {
-        view: 0,
-        camera: camera(),
         background: BACKGROUND.map(|v| v as f32),
         sh_degree,
         rates,
         step: 5,
-        ssim_weight: 0.2,
         opacity_regularizer,
         scale_regularizer,
-        noise: 0.0,
-        dropout: 0.0,
-        noise_seed: 0,
         camera_gradient: true,
-        depth_weight: 0.0,
-        exposure: None,
+        ..StepInput::new(0, camera())
     };
     device.step(&input)?;
     let step = device.download()?;
     let camera = device.camera_gradients()?;
-    // Colours take the first step's update in the second's project. Nothing moves so far that a decision
-    // could differ; the moments tell.
+    // The second step's project applies the first step's color update. Nothing moves far enough to change
+    // a decision; the moments show errors.
     device.upload(begin)?;
     let colors = StepInput { rates: Rates { sh0: 1e-5, sh_rest: 1e-5, ..Rates::ZERO }, ..input };
     device.step(&colors)?;
@@ -347,7 +323,7 @@ mod tests {
     }
 
     #[test]
-    fn the_scene_has_all_that_a_picture_may_have() {
+    fn the_scene_covers_all_cases() {
         let outputs = all_stages::<f64>(&Reference).unwrap();
         let of = |stage: &str, k: usize| {
             &outputs.iter().filter(|(name, _)| *name == stage).nth(k).unwrap().1

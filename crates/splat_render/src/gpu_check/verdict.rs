@@ -1,5 +1,4 @@
-//! That a device passed its self-test, remembered from one process to the next: the test costs a second
-//! or more where kernels have not been compiled before. What failed is tried again each time.
+//! Remembers across processes that a device passed its self-test, which takes about a second.
 
 use std::env;
 use std::hash::{DefaultHasher, Hash, Hasher};
@@ -15,19 +14,12 @@ use crate::io::write_atomically;
 /// Folder of the verdicts; an empty value keeps none.
 const VARIABLE: &str = "IGSR_GPU_CACHE";
 
-/// [`Gpu::new`], with a device that passes [`self_test`] now or, with the same driver and the same
-/// kernels, did before.
-///
-/// # Errors
-/// Those of both.
+/// [`Gpu::new`], with a device that passed [`self_test`] now or earlier with the same driver and kernels.
 pub fn open_tested(software_allowed: bool) -> Result<Arc<Gpu>> {
     open_tested_with(software_allowed, &Injected::default())
 }
 
 /// [`open_tested`] on an adapter with these faults.
-///
-/// # Errors
-/// Those of [`open_tested`].
 pub fn open_tested_with(software_allowed: bool, injected: &Injected) -> Result<Arc<Gpu>> {
     let gpu = Arc::new(Gpu::with_faults(software_allowed, injected)?);
     let verdict = verdict_file(&gpu).filter(|_| injected.is_sound());
@@ -54,7 +46,7 @@ fn verdict_file(gpu: &Gpu) -> Option<PathBuf> {
     Some(folder()?.join(format!("{:016x}.passed", key.finish())))
 }
 
-/// Where programs of the system keep what they can make again.
+/// The system's cache folder.
 fn folder() -> Option<PathBuf> {
     if let Some(folder) = env::var_os(VARIABLE) {
         return (!folder.is_empty()).then(|| PathBuf::from(folder));

@@ -6,8 +6,7 @@ use std::path::{Path, PathBuf};
 
 use crate::error::{Error, Result};
 
-/// Writes through `write` to a temporary name beside `path` and renames it at the end. On any error
-/// the temporary file is removed and what stood at `path` stays.
+/// Writes to a temporary file next to `path` and renames it; on errors the old file stays.
 pub fn write_atomically(
     path: &Path,
     write: impl FnOnce(&mut BufWriter<File>) -> std::io::Result<()>,

@@ -9,7 +9,6 @@ use crate::error::{Error, Result};
 pub struct Named<'a>(pub &'a Path);
 
 impl Named<'_> {
-    /// An error with this reason.
     pub fn bad(&self, reason: impl Into<String>) -> Error {
         Error::file(self.0, reason)
     }
@@ -20,7 +19,6 @@ impl Named<'_> {
     }
 }
 
-/// What is left of some bytes.
 #[derive(Clone, Copy)]
 pub struct Bytes<'a> {
     left: &'a [u8],
@@ -33,12 +31,11 @@ impl<'a> Bytes<'a> {
         Self { left: bytes, named: *named }
     }
 
-    /// How many are left.
     pub fn len(&self) -> usize {
         self.left.len()
     }
 
-    /// The next `count` bytes, which `what` describes.
+    /// The next `count` bytes; `what` describes them in errors.
     pub fn take(&mut self, count: usize, what: &str) -> Result<&'a [u8]> {
         let (taken, left) =
             self.left.split_at_checked(count).ok_or_else(|| self.named.ends_within(what))?;
@@ -58,17 +55,14 @@ pub fn u16_at(bytes: &[u8], at: usize) -> u16 {
     u16::from_le_bytes([bytes[at], bytes[at + 1]])
 }
 
-/// The little-endian u32 at byte `at`; `bytes` must hold it.
 pub fn u32_at(bytes: &[u8], at: usize) -> u32 {
     u32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]])
 }
 
-/// The little-endian u64 at byte `at`; `bytes` must hold it.
 pub fn u64_at(bytes: &[u8], at: usize) -> u64 {
     u64::from(u32_at(bytes, at)) | u64::from(u32_at(bytes, at + 4)) << 32
 }
 
-/// The little-endian f32 at byte `at`; `bytes` must hold it.
 pub fn f32_at(bytes: &[u8], at: usize) -> f32 {
     f32::from_bits(u32_at(bytes, at))
 }

@@ -1,6 +1,6 @@
 //! PlayCanvas's compressed `.ply`: 16 bytes a splat, packed against the bounds of its chunk of 256.
 //!
-//! Element `chunk`: bounds of positions, log-scales and colours, floats. Element `vertex`: four
+//! Element `chunk`: bounds of positions, log-scales and colors, floats. Element `vertex`: four
 //! packed u32. Element `sh`, if any: one byte for each coefficient, all red, green, then blue.
 
 use std::io::{BufRead, Read};
@@ -22,9 +22,8 @@ use crate::splats::SplatArrays;
 const CHUNK: usize = 256;
 /// SH coefficients are in plus or minus half of this.
 const SH_RANGE: f64 = 8.0;
-/// Highest SH degree of the format.
 const SH_DEGREE: u32 = 3;
-/// Largest magnitude of a log-scale in the bounds: what the format's own writers clamp to.
+/// Maximum magnitude of a log-scale in the bounds, as clamped by the format's own writers.
 const SCALE_MAX: f32 = 20.0;
 
 const ROOM: Room =
@@ -36,7 +35,7 @@ const BOUNDS: [[&str; 6]; 3] = [
     ["min_r", "min_g", "min_b", "max_r", "max_g", "max_b"],
 ];
 
-/// Where in a row of `chunk` the six bounds of one kind are.
+/// Columns of the six bounds of one kind in a row of `chunk`.
 type Columns = [usize; 6];
 
 fn columns<const N: usize>(
@@ -48,13 +47,16 @@ fn columns<const N: usize>(
     let mut offsets = [0; N];
     for (offset, name) in offsets.iter_mut().zip(names) {
         *offset = element.offset(name, kind).ok_or_else(|| {
-            named.bad(format!("has no '{name}' in its {}s; it is no compressed .ply", element.name))
+            named.bad(format!(
+                "has no '{name}' in its {}s; it is not a compressed .ply",
+                element.name
+            ))
         })?;
     }
     Ok(offsets)
 }
 
-/// Reads what follows the header.
+/// Reads the data after the header.
 pub fn read(
     reader: &mut impl BufRead,
     header: &Header,
@@ -65,12 +67,12 @@ pub fn read(
         [chunk, vertex, ..] if vertex.name == "vertex" => (chunk, vertex),
         _ => {
             return Err(
-                named.bad("has chunks but no vertices after them; it is no compressed .ply")
+                named.bad("has chunks but no vertices after them; it is not a compressed .ply")
             );
         }
     };
     if header.elements.iter().any(|element| element.lists) {
-        return Err(named.bad("holds lists, which no compressed .ply has"));
+        return Err(named.bad("holds lists, which a compressed .ply cannot have"));
     }
     let sh = header.elements.get(2).filter(|element| element.name == "sh");
     let wanted =
@@ -84,13 +86,13 @@ pub fn read(
     limits::check_file_size(named, size)?;
     if chunk.count != vertex.count.div_ceil(CHUNK as u64) {
         return Err(named.bad(format!(
-            "has {} chunks for {} splats, where each chunk is of {CHUNK}; it is damaged",
+            "has {} chunks for {} splats, but a chunk has {CHUNK}; it is damaged",
             chunk.count, vertex.count
         )));
     }
     let position = columns(chunk, &BOUNDS[0], Kind::Float, named)?;
     let scale = columns(chunk, &BOUNDS[1], Kind::Float, named)?;
-    // Older files have no bounds of colours: those are then in [0, 1].
+    // Older files have no bounds of colors: those are then in [0, 1].
     let color = match chunk.offset(BOUNDS[2][0], Kind::Float) {
         Some(_) => Some(columns(chunk, &BOUNDS[2], Kind::Float, named)?),
         None => None,
@@ -142,7 +144,7 @@ pub fn read(
     })
 }
 
-/// The degree of the element `sh`, and where in its rows each `f_rest_k` is.
+/// The degree of the element `sh`, and the column of each `f_rest_k` in its rows.
 fn rest_columns(sh: &Element, count: u64, named: &Named<'_>) -> Result<(u32, Vec<usize>)> {
     if sh.count != count {
         return Err(named.bad(format!(
@@ -152,13 +154,13 @@ fn rest_columns(sh: &Element, count: u64, named: &Named<'_>) -> Result<(u32, Vec
     }
     let rest = sh.properties.len();
     let degree = (1..=SH_DEGREE).find(|&d| 3 * (sh::coeffs(d) - 1) == rest).ok_or_else(|| {
-        named.bad(format!("has {rest} f_rest properties, which is no SH degree in 1..=3"))
+        named.bad(format!("has {rest} f_rest properties, which match no SH degree in 1..=3"))
     })?;
     let offsets = (0..rest)
         .map(|k| {
             let name = format!("f_rest_{k}");
             sh.offset(&name, Kind::Uchar).ok_or_else(|| {
-                named.bad(format!("has no byte property '{name}'; it is no compressed .ply"))
+                named.bad(format!("has no byte property '{name}'; it is not a compressed .ply"))
             })
         })
         .collect::<Result<_>>()?;
@@ -200,7 +202,7 @@ fn pack_rotation(quat: [f32; 4]) -> u32 {
 }
 
 fn unpack_sh(byte: u8) -> f32 {
-    // The outermost bytes stand for the ends of the range, the others for the middle of a step.
+    // The outermost bytes decode to the ends of the range, inner bytes to the middle of a step.
     let unit = match byte {
         0 => 0.0,
         255 => 1.0,
@@ -307,7 +309,7 @@ impl Bounds {
         Self { low: fold(f32::INFINITY, f32::min), high: fold(f32::NEG_INFINITY, f32::max) }
     }
 
-    /// Where `row` is between the bounds, 0 to 1; 0 where they coincide.
+    /// Position of `row` between the bounds, 0 to 1; 0 if they coincide.
     fn unit(&self, row: [f32; 3]) -> [f64; 3] {
         std::array::from_fn(|k| {
             let (low, high) = (f64::from(self.low[k]), f64::from(self.high[k]));

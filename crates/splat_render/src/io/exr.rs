@@ -22,24 +22,17 @@ pub struct ExrPicture<'a> {
     pub color: &'a [[f32; 3]],
     /// `[H * W]` in 0..1: channel A.
     pub alpha: &'a [f32],
-    /// `[H * W]` camera-space z in world units, 0 where nothing is: channel Z.
+    /// `[H * W]` camera-space z in world units, 0 for empty pixels: channel Z.
     pub depth: &'a [f32],
 }
 
 /// Writes a picture as an EXR file of one layer with the channels A, B, G, R, Z, whole or not at all.
-///
-/// # Errors
-/// Those of [`encode_exr`]; [`Error::File`] if the file cannot be written: the existing file is
-/// unchanged.
 pub fn write_exr(path: &Path, picture: &ExrPicture<'_>) -> Result<()> {
     let bytes = encode_exr(picture)?;
     write_atomically(path, |out| out.write_all(&bytes))
 }
 
-/// The bytes of that file, for callers that write it themselves.
-///
-/// # Errors
-/// [`Error::Argument`] if an array has not `width * height` entries or there is no pixel.
+/// The bytes of such a file.
 pub fn encode_exr(picture: &ExrPicture<'_>) -> Result<Vec<u8>> {
     let ExrPicture { width, height, color, alpha, depth } = *picture;
     let pixels = width.checked_mul(height).filter(|&pixels| pixels > 0).ok_or_else(|| {
@@ -50,7 +43,7 @@ pub fn encode_exr(picture: &ExrPicture<'_>) -> Result<Vec<u8>> {
         if length != pixels {
             return Err(Error::argument(
                 name,
-                format!("has {length} pixels where the picture has {width} x {height}"),
+                format!("has {length} pixels, but the picture has {width} x {height}"),
             ));
         }
     }

@@ -7,16 +7,11 @@ use ::exr::prelude::{FlatSamples, ReadChannels, ReadLayers, read};
 
 use crate::error::{Error, Result};
 
-/// More pixels than this are no photo's depth.
-const MOST_PIXELS: usize = 1 << 28;
+/// Maximum number of pixels of a depth map.
+const PIXELS_MAX: usize = 1 << 28;
 
-/// Reads channel Z of an EXR file's largest layer, or the only channel where there is no Z.
-///
-/// Returns height, width and `[H * W]` numbers, row-major.
-///
-/// # Errors
-/// [`Error::File`] if the file cannot be read; [`Error::Argument`] if it is no EXR, is damaged, or
-/// has several channels of which none is Z.
+/// Reads channel Z of an EXR file's largest layer, or its only channel. Returns height, width and `[H *
+/// W]` numbers, row-major.
 pub fn read_exr_depth(path: &Path) -> Result<(usize, usize, Vec<f32>)> {
     let bytes = std::fs::read(path).map_err(|e| Error::file(path, e.to_string()))?;
     decode(bytes)
@@ -26,10 +21,10 @@ fn decode(bytes: Vec<u8>) -> Result<(usize, usize, Vec<f32>)> {
     let bad = |reason: String| Error::argument("file", reason);
     // Headers first: one that claims too much reserves no memory.
     let meta = ::exr::meta::MetaData::read_from_buffered(Cursor::new(&bytes), false)
-        .map_err(|e| bad(format!("is no OpenEXR file ({e})")))?;
+        .map_err(|e| bad(format!("is not an OpenEXR file ({e})")))?;
     let pixels = meta.headers.iter().map(|header| header.layer_size.area()).max().unwrap_or(0);
-    if pixels > MOST_PIXELS {
-        return Err(bad(format!("has {pixels} pixels; {MOST_PIXELS} are the most")));
+    if pixels > PIXELS_MAX {
+        return Err(bad(format!("has {pixels} pixels; the limit is {PIXELS_MAX}")));
     }
     let image = read()
         .no_deep_data()
@@ -46,7 +41,7 @@ fn decode(bytes: Vec<u8>) -> Result<(usize, usize, Vec<f32>)> {
         None if channels.len() == 1 => &channels[0],
         None => {
             let names: Vec<String> = channels.iter().map(|c| c.name.to_string()).collect();
-            return Err(bad(format!("has the channels {}, and no Z", names.join(", "))));
+            return Err(bad(format!("has the channels {}, but no Z", names.join(", "))));
         }
     };
     let values = match &depth.sample_data {

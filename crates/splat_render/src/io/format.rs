@@ -61,8 +61,7 @@ impl Format {
         ENDINGS.iter().find(|(ending, _)| name.ends_with(ending)).map(|(_, format)| *format)
     }
 
-    /// The format of a file that starts with `head`. A compressed .ply counts as .ply here: its
-    /// header tells.
+    /// The format of a file that starts with `head`; a compressed .ply counts as .ply.
     pub(super) fn of(head: &[u8], named: &Named<'_>) -> Result<Self> {
         let marks: [(&[u8], Self); 7] = [
             (b"ply\n", Self::Ply),
@@ -88,15 +87,15 @@ impl Format {
             _ if head.is_empty() => Err(named.bad("is empty; give a file of splats")),
             (Some(format), _) => Ok(format),
             (None, Some(format @ (Self::Splat | Self::Ksplat))) => Ok(format),
-            // Read on, so that the error says what such a file must start with.
+            // Continue, so that the error names the expected start of the file.
             (None, Some(Self::Ply | Self::CompressedPly)) => Ok(Self::Ply),
             (None, Some(format)) => Err(named.bad(format!(
-                "does not start as a .{} file does; it is damaged or of another kind: give a file \
+                "does not start like a .{} file; it is damaged or of another format: give a file \
                  of splats",
                 format.name()
             ))),
             (None, None) => Err(named.bad(
-                "is no file of splats that can be read: .ply, .splat, .ksplat, .spz, .sog, .glb \
+                "is not a readable file of splats: .ply, .splat, .ksplat, .spz, .sog, .glb \
                  or .gltf",
             )),
         }
@@ -111,6 +110,6 @@ impl Format {
     }
 
     pub(super) fn unwritable(path: &Path) -> Error {
-        Error::file(path, format!("has no ending that can be written; end it in {WRITABLE}"))
+        Error::file(path, format!("has an ending that cannot be written; use {WRITABLE}"))
     }
 }

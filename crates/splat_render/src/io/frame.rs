@@ -1,9 +1,8 @@
-//! The two frames that splat files come in.
+//! The two frames of splat files.
 //!
-//! COLMAP's and so INRIA's scenes, and ours, have y down and z forward at the first camera; .spz
-//! and glTF say that y is up and z back. The half turn about x leads from each to the other: it
-//! changes the signs of y and z, of two components of each rotation and of some SH coefficients,
-//! so that nothing is rounded.
+//! COLMAP's and so INRIA's scenes, and ours, have y down and z forward at the first camera; .spz and glTF
+//! have y up and z back. The half turn about x converts between them: it changes the signs of y and z, of
+//! two components of each rotation and of some SH coefficients, so that nothing is rounded.
 
 use crate::sh;
 use crate::splats::SplatArrays;

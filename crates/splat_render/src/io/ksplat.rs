@@ -1,6 +1,6 @@
 //! mkkellogg's `.ksplat`, versions 0.1 and later: a header, headers of sections, sections.
 //!
-//! Level 0 holds floats; levels 1 and 2 hold positions as u16 about the centre of a bucket and the
+//! Level 0 holds floats; levels 1 and 2 hold positions as u16 about the center of a bucket and the
 //! rest as half floats, level 2 its SH as bytes. SH is per degree: all red, all green, all blue.
 
 use half::f16;
@@ -16,14 +16,13 @@ use crate::splats::SplatArrays;
 
 const HEADER: usize = 4096;
 const SECTION_HEADER: usize = 1024;
-/// Highest SH degree of the format.
 const SH_DEGREE: u32 = 2;
-/// Half the range of level 2's SH bytes where the header gives none.
+/// Half the range of level 2's SH bytes if the header gives none.
 const SH_HALF_RANGE: f32 = 1.5;
-/// Steps from a bucket's centre to its side where the section gives none.
+/// Steps from a bucket's center to its side if the section gives none.
 const POSITION_STEPS: u32 = 32767;
 
-/// Where the parts of a splat are at one compression level.
+/// Layout of a splat at one compression level.
 struct Level {
     scale: usize,
     rotation: usize,
@@ -38,18 +37,16 @@ const LEVELS: [Level; 3] = [
     Level { scale: 6, rotation: 12, color: 20, sh: 24, sh_bytes: 1 },
 ];
 
-/// One section of the file.
 struct Section<'a> {
     count: usize,
     degree: u32,
-    /// Bytes per splat.
     stride: usize,
     rows: &'a [u8],
-    /// Splats per full bucket, and how many buckets are full; the others' sizes follow.
+    /// Splats per full bucket, and the number of full buckets; the sizes of partial buckets follow.
     bucket_size: usize,
     full_buckets: usize,
     partial_sizes: &'a [u8],
-    /// Bytes per bucket, of which the first 12 are its centre.
+    /// Bytes per bucket; the first 12 are its center.
     bucket_stride: usize,
     buckets: &'a [u8],
     /// World units per step of a position.
@@ -57,7 +54,6 @@ struct Section<'a> {
     steps: f32,
 }
 
-/// Reads a whole file.
 pub fn parse(bytes: &[u8], named: &Named<'_>) -> Result<Loaded> {
     let mut data = Bytes::new(bytes, named);
     let header = data.take(HEADER, "header")?;
@@ -69,7 +65,7 @@ pub fn parse(bytes: &[u8], named: &Named<'_>) -> Result<Loaded> {
     }
     let level_number = u16_at(header, 20);
     let level = LEVELS.get(usize::from(level_number)).ok_or_else(|| {
-        named.bad(format!("has the compression level {level_number}, where 0 to 2 are known"))
+        named.bad(format!("has the compression level {level_number}, but only 0 to 2 are known"))
     })?;
     let range = |at: usize, default: f32| match f32_at(header, at) {
         0.0 => default,
@@ -112,11 +108,11 @@ impl<'a> Section<'a> {
         let (full_buckets, partial) = (u32_at(header, 32) as usize, u32_at(header, 36) as usize);
         let degree = u32::from(u16_at(header, 40));
         if degree > SH_DEGREE {
-            return Err(named.bad(format!("has SH degree {degree}, where a .ksplat has 0 to 2")));
+            return Err(named.bad(format!("has SH degree {degree}, but a .ksplat has 0 to 2")));
         }
         if count > reserved {
             return Err(
-                named.bad(format!("has {count} splats where {reserved} fit; it is damaged"))
+                named.bad(format!("has {count} splats, but only {reserved} fit; it is damaged"))
             );
         }
         let bucket_stride = usize::from(u16_at(header, 20));
@@ -142,7 +138,7 @@ impl<'a> Section<'a> {
             steps,
         };
         if level.scale != LEVELS[0].scale && !section.buckets_cover(bucket_count) {
-            return Err(named.bad("has splats that are in none of its buckets; it is damaged"));
+            return Err(named.bad("has splats outside of its buckets; it is damaged"));
         }
         Ok(section)
     }
@@ -151,7 +147,7 @@ impl<'a> Section<'a> {
         u32_at(self.partial_sizes, 4 * bucket) as usize
     }
 
-    /// Whether every splat has a bucket with a centre.
+    /// Whether every splat has a bucket with a center.
     fn buckets_cover(&self, bucket_count: usize) -> bool {
         let partial = self.partial_sizes.len() / 4;
         let full = self.bucket_size.saturating_mul(self.full_buckets);
@@ -192,9 +188,9 @@ impl<'a> Section<'a> {
                     }
                     bucket - 1
                 };
-                let centre = &self.buckets[home * self.bucket_stride..][..12];
+                let center = &self.buckets[home * self.bucket_stride..][..12];
                 std::array::from_fn(|k| {
-                    (f32::from(u16_at(row, 2 * k)) - self.steps) * self.step + f32_at(centre, 4 * k)
+                    (f32::from(u16_at(row, 2 * k)) - self.steps) * self.step + f32_at(center, 4 * k)
                 })
             };
             splats.scales[to] = std::array::from_fn(|k| log_scale(number(row, level.scale, k)));

@@ -4,20 +4,20 @@ use super::bytes::Named;
 use crate::error::Result;
 use crate::sh;
 
-/// Most splats that ids of 32 bits leave room for.
+/// Maximum number of splats with 32-bit ids.
 pub const SPLATS_MAX: u64 = 1 << 30;
 /// Largest file that is read into memory whole. A `.ply` is not, and may be larger.
 pub const FILE_MAX: u64 = 4 << 30;
 /// Splats in memory per byte of file. Files of real scenes unpack to 4 to 20 times their size.
 const UNPACKED_PER_BYTE: u64 = 64;
-/// What any file may unpack to, so that small scenes of equal splats can be read.
+/// Size that any file may unpack to, so that small scenes of equal splats can be read.
 const UNPACKED_FREE: u64 = 64 << 20;
 
 /// Refuses a file that is too large to read into memory.
 pub fn check_file_size(named: &Named<'_>, size: u64) -> Result<()> {
     if size > FILE_MAX {
         return Err(named.bad(format!(
-            "is {size} bytes, more than the {FILE_MAX} that are read at once; split the scene or \
+            "is {size} bytes, more than the limit of {FILE_MAX}; split the scene or \
              convert it to .ply with the program that wrote it"
         )));
     }

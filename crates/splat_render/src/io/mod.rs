@@ -1,9 +1,9 @@
-//! Files of splats, and of pictures ([`write_exr`]); `docs/guides/formats.md` says what
-//! each format of splats holds.
+//! Files of splats and of pictures ([`write_exr`]); `docs/guides/formats.md` describes each format of
+//! splats.
 //!
-//! Files are untrusted: every size that a file claims is checked against the bytes that are there
-//! before memory is allocated for it, and each error is one message. Files are written whole or not
-//! at all.
+//! Files are untrusted: every size that a file claims is checked against the actual number of bytes
+//! before memory is allocated for it, and each error is one message. Files are written whole or not at
+//! all.
 
 mod atomic;
 mod bytes;
@@ -48,12 +48,8 @@ use ply_header::Header;
 /// The index of a scene in levels of detail, which no one file holds.
 const STREAMED: &str = "lod-meta.json";
 
-/// Reads a file of any format in [`Format`]. The format is detected from the content or, where that
-/// has no signature, from the ending. A file named `meta.json` is that of a SOG in a folder.
-///
-/// # Errors
-/// [`crate::Error::File`] that names the file: it cannot be opened or read, is damaged, truncated or
-/// of an unknown format.
+/// Reads a file of any format in [`Format`]. The format is detected from the content or, for formats
+/// without a signature, from the ending. A file named `meta.json` belongs to a SOG in a folder.
 pub fn read_splats(path: &Path) -> Result<Loaded> {
     let named = Named(path);
     if path.file_name().is_some_and(|name| name == sog::META) {
@@ -61,7 +57,7 @@ pub fn read_splats(path: &Path) -> Result<Loaded> {
     }
     if path.file_name().is_some_and(|name| name == STREAMED) {
         return Err(named.bad(
-            "is a scene in levels of detail; look at it with splat-view or igsr view, or give the \
+            "is a scene in levels of detail; open it with splat-view or igsr view, or give the \
              meta.json of one of its folders",
         ));
     }
@@ -79,17 +75,14 @@ pub fn read_splats(path: &Path) -> Result<Loaded> {
     parse(&bytes, format, &named)
 }
 
-/// Reads a file that is in memory, as [`read_splats`] does. `path` is its name in errors, detects
-/// formats without a signature, and locates a `.gltf`'s other files.
-///
-/// # Errors
-/// Those of [`read_splats`].
+/// Reads a file in memory, as [`read_splats`] does. `path` is its name in errors, detects formats without
+/// a signature, and locates a `.gltf`'s other files.
 pub fn parse_splats(bytes: &[u8], path: &Path) -> Result<Loaded> {
     let named = Named(path);
     parse(bytes, Format::of(bytes, &named)?, &named)
 }
 
-/// Reads a `.ply` of `size` bytes: what its header says tells INRIA's from a compressed one.
+/// Reads a `.ply` of `size` bytes: the header distinguishes INRIA's from a compressed one.
 fn read_any_ply(reader: &mut impl BufRead, size: u64, named: &Named<'_>) -> Result<Loaded> {
     let header = Header::read(reader, named)?;
     if header.starts_with("chunk") {
@@ -113,12 +106,8 @@ fn parse(mut bytes: &[u8], format: Format, named: &Named<'_>) -> Result<Loaded> 
     }
 }
 
-/// Writes splats, whole or not at all, in the format of the ending. Returns one message for each
-/// thing that the format cannot hold and that was left out or rounded.
-///
-/// # Errors
-/// [`crate::Error::File`] if the ending names no writable format or the file cannot be written;
-/// [`crate::Error::Argument`] if the splats' arrays differ in length or the format cannot hold them.
+/// Writes splats, whole or not at all, in the format of the ending. Returns one message for each thing
+/// that the format cannot hold and that was left out or rounded.
 pub fn write_splats(path: &Path, file: &SplatFile) -> Result<Vec<String>> {
     let format = Format::to_write(path)?;
     file.splats.validate()?;
@@ -137,24 +126,4 @@ pub fn write_splats(path: &Path, file: &SplatFile) -> Result<Vec<String>> {
     };
     write_atomically(path, |out| out.write_all(&bytes))?;
     Ok(notes)
-}
-
-/// Reads a `.ply`, INRIA's or compressed, whatever its ending.
-///
-/// # Errors
-/// Those of [`read_splats`].
-pub fn read_ply(path: &Path) -> Result<SplatFile> {
-    let named = Named(path);
-    let file = open_file(path)?;
-    let size = file.metadata().map_err(|e| named.bad(format!("cannot be read ({e})")))?.len();
-    Ok(read_any_ply(&mut BufReader::new(file), size, &named)?.file)
-}
-
-/// Writes INRIA's `.ply`, whatever the path's ending.
-///
-/// # Errors
-/// Those of [`write_splats`].
-pub fn write_ply(path: &Path, file: &SplatFile) -> Result<()> {
-    file.splats.validate()?;
-    write_atomically(path, |out| ply::write(out, file))
 }

@@ -1,9 +1,8 @@
 //! INRIA's `.ply` of 3DGS: one `vertex` element of float properties, binary little-endian.
 //!
-//! Properties: x y z, nx ny nz (zero), f_dc_0..2, f_rest_* (all red, then green, then blue),
-//! opacity (logit), scale_0..2 (logs), rot_0..3 (wxyz). A header line `comment origin X Y Z` holds
-//! the f64 origin where it is not zero, means are then relative to it; `comment antialiased` says
-//! that opacities are.
+//! Properties: x y z, nx ny nz (zero), f_dc_0..2, f_rest_* (all red, then green, then blue), opacity
+//! (logit), scale_0..2 (logs), rot_0..3 (wxyz). A header line `comment origin X Y Z` holds a nonzero f64
+//! origin, and means are then relative to it; `comment antialiased` marks antialiased opacities.
 
 use std::io::{BufRead, Write};
 
@@ -15,11 +14,9 @@ use crate::error::Result;
 use crate::sh;
 use crate::splats::SplatArrays;
 
-/// Where each number of a splat lies in the rows of a `.ply`.
+/// Columns of a splat's numbers in the rows of a `.ply`.
 pub struct Rows {
-    /// Number of splats.
     pub count: usize,
-    /// SH degree.
     pub degree: u32,
     xyz: Vec<usize>,
     quat: Vec<usize>,
@@ -31,11 +28,11 @@ pub struct Rows {
 }
 
 impl Rows {
-    /// Those that a header says, of a file of `size` bytes; nothing large is allocated.
+    /// The columns by the header of a file of `size` bytes; allocates nothing large.
     pub fn new(header: &Header, size: u64, named: &Named<'_>) -> Result<Self> {
         let vertex = &header.elements[0];
         if vertex.name != "vertex" {
-            return Err(named.bad(format!("starts with '{}' where 'vertex' belongs", vertex.name)));
+            return Err(named.bad(format!("starts with '{}' instead of 'vertex'", vertex.name)));
         }
         if vertex.lists {
             return Err(named.bad("holds lists in its vertices; it is a mesh, not splats"));
@@ -63,7 +60,7 @@ impl Rows {
             .find(|&d| 3 * (sh::coeffs(d) - 1) == rest_count)
             .ok_or_else(|| {
                 named.bad(format!(
-                    "has {rest_count} f_rest properties, which is no SH degree in 0..=4"
+                    "has {rest_count} f_rest properties, which match no SH degree in 0..=4"
                 ))
             })?;
         let rest: Vec<usize> =
@@ -78,7 +75,7 @@ impl Rows {
         Ok(Self { count, degree, xyz, quat, scale, opacity, dc, rest, row })
     }
 
-    /// Reads the next row, that of splat `number`, into splat `i`.
+    /// Reads the next row, of splat `number`, into splat `i`.
     pub fn read(
         &mut self,
         reader: &mut impl BufRead,
@@ -105,8 +102,7 @@ impl Rows {
     }
 }
 
-/// Reads what follows the header of a `.ply` of `size` bytes, row by row; sizes are checked before
-/// anything is allocated.
+/// Reads the data of a `.ply` of `size` bytes row by row; checks sizes before allocating.
 pub fn read(
     reader: &mut impl BufRead,
     header: &Header,

@@ -10,16 +10,11 @@ use crate::error::Result;
 /// Longest header that is read: real ones are under 3 kB.
 const HEADER_MAX: u64 = 1 << 16;
 
-/// Types of properties that splat files have.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
-    /// 32-bit float.
     Float,
-    /// Unsigned 32-bit integer.
     Uint,
-    /// Unsigned byte.
     Uchar,
-    /// Anything else.
     Other,
 }
 
@@ -39,9 +34,7 @@ fn scalar(name: &str) -> Option<(usize, Kind)> {
 
 /// A property of an element.
 pub struct Property {
-    /// Its name.
     pub name: String,
-    /// Its type.
     pub kind: Kind,
     /// Its first byte within a row.
     pub offset: usize,
@@ -49,9 +42,7 @@ pub struct Property {
 
 /// A table of the file.
 pub struct Element {
-    /// Its name.
     pub name: String,
-    /// Rows.
     pub count: u64,
     /// Bytes per row.
     pub stride: usize,
@@ -67,13 +58,11 @@ impl Element {
         self.properties.iter().find(|p| p.kind == kind && p.name == name).map(|p| p.offset)
     }
 
-    /// Bytes of all rows.
     pub fn size(&self) -> u64 {
         self.count.saturating_mul(self.stride as u64)
     }
 }
 
-/// What the header says.
 #[derive(Default)]
 pub struct Header {
     /// Tables in the order of the file.
@@ -170,7 +159,7 @@ impl Header {
     }
 }
 
-/// The header's first lines, which hold what .ply has no property for.
+/// The header's first lines, with the data that .ply has no property for.
 pub fn write_comments(out: &mut impl Write, file: &SplatFile) -> std::io::Result<()> {
     writeln!(out, "ply\nformat binary_little_endian 1.0")?;
     if file.origin != [0.0; 3] {

@@ -1,4 +1,4 @@
-//! What of a scene a format can hold, and the notes about what it cannot.
+//! The part of a scene that a format can hold, and notes about the rest.
 
 use std::borrow::Cow;
 
@@ -8,15 +8,11 @@ use crate::error::Error;
 use crate::sh;
 use crate::splats::SplatArrays;
 
-/// What a format has room for.
+/// Capabilities of a format.
 pub struct Room {
-    /// Its name in messages.
     pub name: &'static str,
-    /// Highest SH degree.
     pub sh_degree: u32,
-    /// Whether it holds the f64 origin.
     pub origin: bool,
-    /// Whether it holds the antialiased flag.
     pub antialiased: bool,
 }
 
@@ -31,7 +27,7 @@ pub fn prepare<'a>(
     let left_out = splats.len() - drawn.len();
     if left_out > 0 {
         notes.push(format!(
-            "{} that no renderer draws (not finite, or without a rotation) {} left out.",
+            "{} that cannot be drawn (not finite, or without a rotation) {} left out.",
             counted(left_out),
             if left_out == 1 { "is" } else { "are" }
         ));
@@ -40,7 +36,7 @@ pub fn prepare<'a>(
     if splats.sh_degree > room.sh_degree {
         notes.push(if room.sh_degree == 0 {
             format!(
-                "A {} holds no view-dependent colour: the spherical harmonics of degree 1 to {} \
+                "A {} has no view-dependent color: the spherical harmonics of degree 1 to {} \
                  are dropped.",
                 room.name, splats.sh_degree
             )
@@ -67,7 +63,7 @@ pub fn prepare<'a>(
     }
     if !room.antialiased && file.antialiased {
         notes.push(format!(
-            "A {} cannot say that the splats are antialiased: choose that in the viewer.",
+            "A {} cannot store that the splats are antialiased: choose this in the viewer.",
             room.name
         ));
     }
@@ -79,7 +75,7 @@ pub fn counted(count: usize) -> String {
     format!("{count} splat{}", if count == 1 { "" } else { "s" })
 }
 
-/// Says that values, which `what` names one of, were beyond a format's range, if any were.
+/// Notes that `count` values, such as `what`, were beyond a format's range, if any were.
 pub fn say_clipped(notes: &mut Vec<String>, count: usize, what: &str, range: &str) {
     match count {
         0 => {}
@@ -112,5 +108,5 @@ pub fn cut_degree(splats: &SplatArrays, degree: u32) -> SplatArrays {
 
 /// The error of splats that a format has no way to hold.
 pub fn unfit(what: &str) -> Error {
-    Error::argument("splats", format!("{what}; write a .ply, which has no such limit"))
+    Error::argument("splats", format!("{what}; write a .ply, which has no limit"))
 }

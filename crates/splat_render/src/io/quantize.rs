@@ -2,11 +2,10 @@
 
 use crate::sh::C0;
 
-/// Where in its step an opacity byte of 0 or 255 is taken to be, of 255 steps: logits of exactly 0
-/// and 1 would be infinite, and whatever was written lies within half a step of them.
+/// Position within its step of an opacity byte of 0 or 255: logits of exactly 0 and 1 would be infinite,
+/// and the written value lies within half a step of them.
 const OPACITY_END: f64 = 0.25 / 255.0;
 
-/// 1 / (1 + exp(-x)).
 pub fn sigmoid(logit: f32) -> f64 {
     1.0 / (1.0 + (-f64::from(logit)).exp())
 }
@@ -35,12 +34,12 @@ pub fn unit_byte(value: f64) -> u8 {
     (value * 255.0).round() as u8
 }
 
-/// 0.5 + C0 dc: the colour of a splat without view dependence.
+/// 0.5 + C0 dc: the color of a splat without view dependence.
 pub fn color_of_dc(dc: f32) -> f64 {
     0.5 + C0 * f64::from(dc)
 }
 
-/// The DC coefficient of a colour.
+/// The DC coefficient of a color.
 pub fn dc_of_color(color: f64) -> f32 {
     ((color - 0.5) / C0) as f32
 }
@@ -55,8 +54,7 @@ pub fn unit_bits(value: f64, bits: u32) -> u32 {
 pub struct SmallestThree {
     /// Index of the component that is left out, the largest.
     pub largest: usize,
-    /// The others in order, each in [-sqrt(1/2), sqrt(1/2)], of the sign that makes the largest
-    /// positive.
+    /// The rest in order, each in [-sqrt(1/2), sqrt(1/2)], with the sign that makes the largest positive.
     pub others: [f64; 3],
 }
 
@@ -75,7 +73,6 @@ impl SmallestThree {
         Self { largest, others: std::array::from_fn(|_| others.next().unwrap_or(0.0)) }
     }
 
-    /// The unit quaternion.
     pub fn quat(&self) -> [f64; 4] {
         let rest = 1.0 - self.others.iter().map(|c| c * c).sum::<f64>();
         let mut others = self.others.iter();
@@ -89,12 +86,10 @@ impl SmallestThree {
     }
 }
 
-/// `x` as f32.
 pub fn to_f32<const N: usize>(x: [f64; N]) -> [f32; N] {
     x.map(|c| c as f32)
 }
 
-/// `x` as f64.
 pub fn to_f64<const N: usize>(x: [f32; N]) -> [f64; N] {
     x.map(f64::from)
 }

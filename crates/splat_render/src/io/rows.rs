@@ -11,8 +11,7 @@ use super::{open_file, read_splats};
 use crate::error::Result;
 use crate::splats::SplatArrays;
 
-/// A file of splats, from the first to the last. A `.ply` of floats stays on the disk; files of other
-/// formats are smaller, and read whole.
+/// A stream of a file's splats. A `.ply` of floats is read in parts, smaller formats whole.
 pub struct SplatRows {
     path: PathBuf,
     source: Source,
@@ -29,16 +28,13 @@ pub struct SplatRows {
 }
 
 enum Source {
-    /// The file, its rows, and where these begin.
+    /// The file, its columns, and the offset of its rows.
     Ply(BufReader<File>, Rows, u64),
     Whole(SplatArrays),
 }
 
 impl SplatRows {
     /// Opens a file of any format.
-    ///
-    /// # Errors
-    /// Those of [`read_splats`].
     pub fn open(path: &Path) -> Result<Self> {
         if let Some(rows) = Self::open_ply(path)? {
             return Ok(rows);
@@ -83,9 +79,6 @@ impl SplatRows {
     }
 
     /// Begins again at the first splat.
-    ///
-    /// # Errors
-    /// [`crate::Error::File`]: the file cannot be read.
     pub fn rewind(&mut self) -> Result<()> {
         self.done = 0;
         if let Source::Ply(reader, _, start) = &mut self.source {
@@ -97,10 +90,7 @@ impl SplatRows {
         Ok(())
     }
 
-    /// The next splats, at most so many; none after the last.
-    ///
-    /// # Errors
-    /// [`crate::Error::File`]: the file cannot be read, or ends early.
+    /// The next splats, at most `most`; empty at the end.
     pub fn next(&mut self, most: usize) -> Result<SplatArrays> {
         let named = Named(&self.path);
         let first = self.done;

@@ -3,8 +3,7 @@
 use crate::constants::{SH_COEFFS_MAX, SH_DEGREE_MAX};
 use crate::sh;
 
-/// Directions that a band's functions are compared at: enough for the 9 of degree 4 to be told
-/// apart with room to spare.
+/// Directions at which a band's functions are compared, far more than the 9 functions of degree 4.
 const DIRECTIONS: usize = 64;
 
 /// The matrix of each degree from 1 on, `[2 degree + 1]^2`, that gives the turned coefficients.
@@ -49,8 +48,7 @@ impl ShRotation {
 
 type Basis = [f64; SH_COEFFS_MAX];
 
-/// Solves sum_a x[a][b] Y_a(d) = Y_b(back(d)) over all directions, in the sense of least squares:
-/// the bands are closed under rotation, so nothing is left over.
+/// Solves sum_a x[a][b] Y_a(d) = Y_b(back(d)) by least squares; exact, since bands are closed.
 fn band_matrix(degree: u32, bases: &[(Basis, Basis)]) -> Vec<f64> {
     let start = sh::coeffs(degree - 1);
     let each = sh::coeffs(degree) - start;
@@ -96,7 +94,7 @@ mod tests {
     use glam::{DQuat, DVec3};
 
     #[test]
-    fn a_turned_scene_shows_each_direction_what_it_showed_before() {
+    fn a_turned_scene_keeps_its_colors_in_each_direction() {
         let turn = DQuat::from_axis_angle(DVec3::new(0.3, -0.5, 0.8).normalize(), 1.1);
         let rotation = ShRotation::new(|d| (turn.inverse() * DVec3::from_array(d)).to_array());
         let before: Vec<[f32; 3]> =

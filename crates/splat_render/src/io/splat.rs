@@ -1,6 +1,6 @@
 //! antimatter15's `.splat`: 32 bytes a splat and no header.
 //!
-//! Position and scale as floats, colour and opacity as bytes, rotation wxyz as bytes.
+//! Position and scale as floats, color and opacity as bytes, rotation wxyz as bytes.
 
 use super::bytes::{Named, f32_at};
 use super::prepare::{Room, prepare, say_clipped, unfit};
@@ -9,16 +9,14 @@ use super::{Format, Loaded, SplatFile};
 use crate::error::Result;
 use crate::splats::SplatArrays;
 
-/// Bytes per splat.
 const ROW: usize = 32;
 const ROOM: Room = Room { name: ".splat", sh_degree: 0, origin: false, antialiased: false };
 
-/// Reads a whole file.
 pub fn parse(bytes: &[u8], named: &Named<'_>) -> Result<Loaded> {
     let (rows, rest) = bytes.as_chunks::<ROW>();
     if !rest.is_empty() {
         return Err(named.bad(format!(
-            "is {} bytes, no multiple of the {ROW} of a splat; it is truncated or no .splat",
+            "is {} bytes, not a multiple of the {ROW} of a splat; it is truncated or not a .splat",
             bytes.len()
         )));
     }
@@ -47,11 +45,10 @@ pub fn linear_scale(log: f32) -> f32 {
     f64::from(log).exp().min(f64::from(f32::MAX)) as f32
 }
 
-/// The whole file.
 pub fn encode(file: &SplatFile, notes: &mut Vec<String>) -> Result<Vec<u8>> {
     let splats = prepare(file, &ROOM, notes);
     if splats.is_empty() {
-        return Err(unfit("none are left to write, and a .splat of none would be an empty file"));
+        return Err(unfit("no splats are left to write, and the .splat would be an empty file"));
     }
     let mut out = Vec::with_capacity(ROW * splats.len());
     let mut clipped = 0;
@@ -69,6 +66,6 @@ pub fn encode(file: &SplatFile, notes: &mut Vec<String>) -> Result<Vec<u8>> {
         // `as` saturates: 1 becomes 255.
         out.extend(quat.map(|c| (c / norm * 128.0 + 128.0).round() as u8));
     }
-    say_clipped(notes, clipped, "colour", "0 to 1");
+    say_clipped(notes, clipped, "color", "0 to 1");
     Ok(out)
 }

@@ -1,4 +1,4 @@
-//! What files of splats hold.
+//! The content of splat files.
 
 use super::format::Format;
 use crate::splats::SplatArrays;
@@ -17,7 +17,7 @@ pub struct SplatFile {
 /// A file that was read.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Loaded {
-    /// What it holds.
+    /// The content.
     pub file: SplatFile,
     /// The format it was in.
     pub format: Format,

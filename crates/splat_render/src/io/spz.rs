@@ -1,9 +1,9 @@
-//! Niantic's `.spz`: attributes one after the other, compressed.
+//! Niantic's `.spz`: compressed arrays of attributes.
 //!
 //! Versions 2 and 3 are one gzip stream of a 16-byte header and six arrays; version 4 is a 32-byte
-//! header, extensions, a table of sizes, and a zstd stream for each array. Positions are 24-bit
-//! fixed point, rotations three bytes (2) or the smallest three in 32 bits (3, 4). The frame has y
-//! up and z back.
+//! header, extensions, a table of sizes, and a zstd stream for each array. Positions are 24-bit fixed
+//! point, rotations three bytes (2) or the smallest three in 32 bits (3, 4). The frame has y up and z
+//! back.
 
 use std::io::{Read, Write};
 
@@ -32,11 +32,11 @@ const FLAG_ANTIALIASED: u8 = 1;
 const FLAG_EXTENSIONS: u8 = 2;
 /// Most bytes of extensions that are looked through: real ones are a few numbers.
 const EXTENSIONS_MAX: u64 = 1 << 20;
-/// Largest zstd window besides an array's own size: what RFC 8878 asks decoders to support.
+/// Maximum zstd window besides an array's own size; RFC 8878 asks decoders to support it.
 const WINDOW_MAX: u64 = 8 << 20;
 /// Most bits after the point: positions have 24 in all.
 const FRACTION_BITS_MAX: u8 = 24;
-/// A colour byte is (0.5 + 0.15 dc) 255.
+/// A color byte is (0.5 + 0.15 dc) 255.
 const COLOR_SCALE: f64 = 0.15;
 /// A scale byte is (log-scale + 10) 16.
 const SCALE_OFFSET: f64 = 10.0;
@@ -49,7 +49,7 @@ const ROTATION_STEPS: f64 = 511.0;
 const ROOM: Room =
     Room { name: ".spz", sh_degree: SH_DEGREE_MAX, origin: false, antialiased: true };
 
-/// What the headers of all versions say.
+/// The fields of all versions' headers.
 struct Header {
     version: u32,
     count: usize,
@@ -61,7 +61,7 @@ struct Header {
 impl Header {
     fn read(header: &[u8], size: usize, named: &Named<'_>) -> Result<Self> {
         if !header.starts_with(MAGIC) {
-            return Err(named.bad("is compressed but no .spz; give a file of splats"));
+            return Err(named.bad("is compressed but not a .spz; give a file of splats"));
         }
         let (version, degree, fraction_bits) = (u32_at(header, 4), header[12], header[13]);
         if !(2..=4).contains(&version) {
@@ -70,11 +70,11 @@ impl Header {
             )));
         }
         if u32::from(degree) > SH_DEGREE_MAX {
-            return Err(named.bad(format!("has SH degree {degree}, where 0 to 4 are known")));
+            return Err(named.bad(format!("has SH degree {degree}, but only 0 to 4 are known")));
         }
         if fraction_bits > FRACTION_BITS_MAX {
             return Err(named.bad(format!(
-                "has positions of {fraction_bits} fractional bits, where 24 bits are all; it is \
+                "has positions of {fraction_bits} fractional bits, but only 24 bits; it is \
                  damaged"
             )));
         }
@@ -83,14 +83,13 @@ impl Header {
         Ok(Self { version, count, degree, fraction_bits, flags: header[14] })
     }
 
-    /// Bytes of each array: positions, opacities, colours, scales, rotations, SH.
+    /// Bytes of each array: positions, opacities, colors, scales, rotations, SH.
     fn sizes(&self) -> [usize; 6] {
         let rotation = if self.version == 2 { 3 } else { 4 };
         [9, 1, 3, 3, rotation, 3 * (sh::coeffs(self.degree) - 1)].map(|each| each * self.count)
     }
 }
 
-/// Reads a whole file.
 pub fn parse(bytes: &[u8], named: &Named<'_>) -> Result<Loaded> {
     let (header, data) =
         if bytes.starts_with(MAGIC) { open_4(bytes, named)? } else { open_gzip(bytes, named)? };
@@ -101,7 +100,7 @@ pub fn parse(bytes: &[u8], named: &Named<'_>) -> Result<Loaded> {
     }
     let mut notes = Vec::new();
     if header.flags & FLAG_EXTENSIONS != 0 {
-        notes.push("Extensions of the .spz are passed over.".to_owned());
+        notes.push("Extensions of the .spz are ignored.".to_owned());
     }
     let splats = unpack(&header, arrays);
     let antialiased = header.flags & FLAG_ANTIALIASED != 0;
@@ -117,7 +116,7 @@ fn open_gzip(bytes: &[u8], named: &Named<'_>) -> Result<(Header, Vec<u8>)> {
     gzip.read_exact(&mut header).map_err(damaged)?;
     let header = Header::read(&header, bytes.len(), named)?;
     if header.version == 4 {
-        return Err(named.bad("is of version 4 but compressed as version 3 is; it is damaged"));
+        return Err(named.bad("is of version 4 but compressed as version 3; it is damaged"));
     }
     let wanted = header.sizes().iter().sum::<usize>();
     let mut data = Vec::new();
@@ -132,7 +131,7 @@ fn open_gzip(bytes: &[u8], named: &Named<'_>) -> Result<(Header, Vec<u8>)> {
     Ok((header, data))
 }
 
-/// Whether `bytes` are records of a type, a length and so many bytes, up to the last byte.
+/// Whether `bytes` are records of a type, a length and that number of bytes, up to the last byte.
 fn records_fill(mut bytes: &[u8]) -> bool {
     while bytes.len() >= 8 {
         let length = u32_at(bytes, 4) as usize;
@@ -158,7 +157,7 @@ fn open_4(bytes: &[u8], named: &Named<'_>) -> Result<(Header, Vec<u8>)> {
     let sizes: Vec<usize> = header.sizes().into_iter().filter(|&size| size > 0).collect();
     if usize::from(head[15]) != sizes.len() {
         return Err(named.bad(format!(
-            "has {} streams where {} splats of SH degree {} take {}; it is damaged",
+            "has {} streams, but {} splats of SH degree {} take {}; it is damaged",
             head[15],
             header.count,
             header.degree,
@@ -173,7 +172,7 @@ fn open_4(bytes: &[u8], named: &Named<'_>) -> Result<(Header, Vec<u8>)> {
         let (compressed, unpacked) = (u64_at(row, 0), u64_at(row, 8));
         if unpacked != size as u64 {
             return Err(named.bad(format!(
-                "has a stream of {unpacked} bytes where {size} belong; it is damaged"
+                "has a stream of {unpacked} bytes instead of {size}; it is damaged"
             )));
         }
         let compressed = usize::try_from(compressed).unwrap_or(usize::MAX);
@@ -252,10 +251,7 @@ fn pack_rotation(wxyz: [f32; 4]) -> u32 {
     })
 }
 
-/// Bits after the point that leave room for the largest coordinate.
-///
-/// Units are arbitrary here, so positions get all the 24 bits there are, where a fixed number of
-/// fractional bits would suit scenes of one size.
+/// Bits after the point that leave room for the largest coordinate, as units are arbitrary.
 fn fraction_bits(splats: &SplatArrays) -> Result<u8> {
     let largest = splats.means.as_flattened().iter().fold(0.0f32, |far, c| far.max(c.abs()));
     let limit = f64::from((1u32 << 23) - 1);
@@ -271,7 +267,7 @@ fn fraction_bits(splats: &SplatArrays) -> Result<u8> {
 pub fn encode(file: &SplatFile, notes: &mut Vec<String>) -> Result<Vec<u8>> {
     let splats = prepare(file, &ROOM, notes);
     let (n, stride) = (splats.len(), splats.stride());
-    let count = u32::try_from(n).map_err(|_| unfit("a .spz holds 2^32 splats"))?;
+    let count = u32::try_from(n).map_err(|_| unfit("a .spz holds at most 2^32 splats"))?;
     let bits = fraction_bits(&splats)?;
     if splats.sh_degree == SH_DEGREE_MAX {
         notes.push("Readers of .spz before 2026 know no SH of degree 4.".to_owned());
@@ -295,7 +291,7 @@ pub fn encode(file: &SplatFile, notes: &mut Vec<String>) -> Result<Vec<u8>> {
         clipped += usize::from(!(0.0..=1.0).contains(&value));
         data.push(unit_byte(value));
     }
-    say_clipped(notes, clipped, "colour coefficient", "-3.3 to 3.3");
+    say_clipped(notes, clipped, "color coefficient", "-3.3 to 3.3");
     clipped = 0;
     for scale in splats.scales.as_flattened() {
         let value = ((f64::from(*scale) + SCALE_OFFSET) * SCALE_STEPS).round();

@@ -1,22 +1,23 @@
 //! Space in cells of about equally many splats: a tree of planes across the axes.
 
-/// A part of space.
 pub enum Node {
-    /// What lies below a plane across an axis, and the rest.
-    Split { axis: usize, at: f32, halves: [usize; 2] },
-    /// A cell, by its number.
+    /// Splits at a plane across an axis: below it and the rest.
+    Split {
+        axis: usize,
+        at: f32,
+        halves: [usize; 2],
+    },
     Cell(usize),
 }
 
 /// The tree; its root comes first.
 pub struct Cells {
-    /// All nodes.
     pub nodes: Vec<Node>,
-    /// Number of cells, which are numbered along the tree: neighbours have near numbers.
+    /// Number of cells, which are numbered along the tree: neighbors have near numbers.
     pub count: usize,
 }
 
-/// Below and above what part of the points a cell's side is measured: a few are far out.
+/// Quantiles between which a cell's side is measured, since a few points are far out.
 const ENDS: [f64; 2] = [0.1, 0.9];
 
 impl Cells {
@@ -56,8 +57,7 @@ impl Cells {
     }
 }
 
-/// The axis along which points spread most, a plane at their middle, and how many lie below it; those are
-/// put in front. None if no plane has points on both sides.
+/// Splits points at the middle of their longest axis; None if no plane has points on both sides.
 fn split(points: &mut [[f32; 3]]) -> Option<(usize, f32, usize)> {
     let last = points.len() - 1;
     let mut at = |axis: usize, part: f64| {
@@ -71,7 +71,7 @@ fn split(points: &mut [[f32; 3]]) -> Option<(usize, f32, usize)> {
         points.sort_unstable_by(|a, b| a[axis].total_cmp(&b[axis]));
         let plane = points[points.len() / 2][axis];
         let below = points.partition_point(|p| p[axis] < plane);
-        // Where half of them lie on the plane itself, the next larger number is as good.
+        // If half of them lie on the plane, use the next larger number.
         let (plane, below) = match below {
             0 => {
                 let below = points.partition_point(|p| p[axis] <= plane);
@@ -91,7 +91,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn cells_hold_about_equally_many_and_a_point_is_in_one() {
+    fn cells_are_balanced_and_each_point_is_in_one() {
         let mut points: Vec<[f32; 3]> = (0..1000u32)
             .map(|i| [0, 1, 2].map(|k| ((i * [7, 11, 13][k]) % 101) as f32 * [1.0, 3.0, 0.1][k]))
             .collect();

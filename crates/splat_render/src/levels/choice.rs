@@ -1,5 +1,5 @@
-//! Which level of each cell to draw: the coarsest of all, then finer where it is seen most, until a budget
-//! of splats is spent or nothing more could be seen.
+//! Chooses the level of each cell to draw: starts from the coarsest and refines the most visible cells
+//! until a budget of splats is spent or a finer level would not be visible.
 
 use std::cmp::Ordering;
 use std::collections::BinaryHeap;
@@ -14,7 +14,7 @@ const UNSEEN_PART: usize = 4;
 /// A box and its splats, which reach out of it, are taken for a ball this much larger.
 const REACH: f64 = 1.5;
 
-/// From where a scene is looked at.
+/// A camera's view for the choice.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct View {
     /// The camera, in the world.
@@ -55,10 +55,8 @@ impl Ord for Candidate {
     }
 }
 
-/// Chooses levels for a view so that no more splats than the budget are held.
-///
-/// The budget counts the chosen level of each cell and its coarsest, which is kept so that something is
-/// there while the view moves.
+/// Chooses levels for a view within the budget, which counts the chosen level of each cell and its
+/// coarsest, kept for moving views.
 pub fn choose(manifest: &Manifest, view: &View, budget: usize) -> Choice {
     let cells = &manifest.cells;
     let origin = DVec3::from(manifest.origin);
@@ -114,7 +112,7 @@ pub fn choose(manifest: &Manifest, view: &View, budget: usize) -> Choice {
     out
 }
 
-/// All cells as coarse as there are, as many as the budget has room for.
+/// All cells at their coarsest level, as far as the budget permits.
 pub fn coarsest(manifest: &Manifest, budget: usize) -> Choice {
     let cells = &manifest.cells;
     let mut out = Choice { levels: vec![None; cells.len()], order: Vec::new(), held: 0 };
@@ -138,7 +136,7 @@ fn count(cell: &Cell, level: usize) -> usize {
     cell.runs[level].map_or(0, |run| run.count)
 }
 
-/// What a cell at a level costs: the coarsest is held beside it.
+/// Splats in memory for a cell at a level; the coarsest level stays loaded too.
 fn held(cell: &Cell, level: usize) -> usize {
     let coarsest = cell.runs.iter().rposition(Option::is_some).filter(|&c| c != level);
     count(cell, level) + coarsest.map_or(0, |c| count(cell, c))
@@ -216,7 +214,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_out_of_the_picture_stays_coarse_and_is_bounded() {
+    fn cells_outside_of_the_picture_stay_coarse() {
         let choice = choose(&row(), &view(1005.2, 0.0), 5000);
         assert_eq!(choice.levels[..4], [Some(2); 4]);
         assert_eq!(choice.levels[6..], [Some(0); 4]);
@@ -225,7 +223,7 @@ mod tests {
     }
 
     #[test]
-    fn from_afar_nothing_finer_is_chosen_than_can_be_seen() {
+    fn levels_are_no_finer_than_visible() {
         let manifest = row();
         let far = choose(&manifest, &view(700.0, 1.0), 5000);
         assert_eq!(far.levels, vec![Some(2); 10]);

@@ -1,9 +1,9 @@
-//! `lod-meta.json`: which cells there are, and where the splats of their levels lie.
+//! `lod-meta.json`: the cells, and the files of their levels.
 //!
 //! The layout is PlayCanvas's, version 1
-//! (<https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/streamed-sog/>). Its tree of
-//! two halves each is read as a list of its leaves, the cells. `origin` is our own field, which others pass
-//! over.
+//! (<https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/streamed-sog/>). Its binary
+//! tree is read as a list of its leaves, the cells. `origin` is igsr's own field, which other readers
+//! ignore.
 
 use std::io::Read;
 use std::path::{Component, Path, PathBuf};
@@ -45,7 +45,7 @@ pub struct Cell {
     pub errors: Vec<f64>,
 }
 
-/// What the file says.
+/// The content of the file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Manifest {
     /// Its folder.
@@ -58,15 +58,12 @@ pub struct Manifest {
     pub origin: [f64; 3],
     /// Leaves of the tree.
     pub cells: Vec<Cell>,
-    /// A SOG of what is drawn always, such as a sky.
+    /// A SOG that is always drawn, such as a sky.
     pub environment: Option<PathBuf>,
 }
 
 impl Manifest {
-    /// Reads the file, or that of a folder.
-    ///
-    /// # Errors
-    /// [`Error::File`] that names the file: it cannot be read, or what it says is no such scene.
+    /// Reads the file, or the one in a folder.
     pub fn read(path: &Path) -> Result<Self> {
         let file = if path.is_dir() { path.join(INDEX) } else { path.to_owned() };
         let bad = |what: String| Error::file(&file, format!("{what}; write the levels again"));
@@ -79,7 +76,7 @@ impl Manifest {
             return Err(bad(format!("has more than {SIZE_MAX} bytes")));
         }
         let json: Value =
-            serde_json::from_slice(&text).map_err(|e| bad(format!("is no JSON ({e})")))?;
+            serde_json::from_slice(&text).map_err(|e| bad(format!("is not JSON ({e})")))?;
         drop(text);
         parse(&json, file.parent().unwrap_or(Path::new(""))).map_err(bad)
     }
@@ -103,7 +100,7 @@ fn parse(json: &Value, folder: &Path) -> Reason {
     if let Some(version) = json.get("version")
         && version.as_f64() != Some(1.0)
     {
-        return Err(format!("is of version {version}, where 1 is known"));
+        return Err(format!("is of version {version}, but only 1 is known"));
     }
     let levels = json.get("lodLevels").and_then(Value::as_u64);
     let levels = levels
@@ -148,7 +145,7 @@ fn parse(json: &Value, folder: &Path) -> Reason {
                     out.cells.push(cell);
                 }
             }
-            _ => return Err("has a node that has not either children or lods".to_owned()),
+            _ => return Err("has a node without either children or lods".to_owned()),
         }
     }
     check_apart(&out)?;
@@ -167,10 +164,10 @@ fn leaf(
         .filter(|(low, high)| (0..3).all(|k| low[k] <= high[k]))
         .ok_or("has a cell without a bound")?;
     let mut runs = vec![None; manifest.levels];
-    for (level, run) in lods.as_object().ok_or("has lods that are no object")? {
+    for (level, run) in lods.as_object().ok_or("has lods that are not an object")? {
         let place = level.parse().ok().filter(|&level: &usize| level < manifest.levels);
-        let place =
-            place.ok_or_else(|| format!("has a level {level:?} where {} are", manifest.levels))?;
+        let place = place
+            .ok_or_else(|| format!("has a level {level:?}, but there are {}", manifest.levels))?;
         let number = |name: &str| {
             let value = run.get(name).and_then(Value::as_u64).filter(|&n| n <= 1 << 30);
             value.map(|n| n as usize).ok_or_else(|| format!("has a level without a valid {name}"))
@@ -187,15 +184,14 @@ fn leaf(
                 errors.as_array().and_then(|e| e.iter().map(Value::as_f64).collect());
             errors
                 .filter(|e| e.len() == manifest.levels && e.iter().all(|x| *x >= 0.0))
-                .ok_or("has a cell whose errors are not one number for each level")?
+                .ok_or("has a cell without one number in errors for each level")?
         }
         None => spacings(&low, &high, &runs),
     };
     Ok(Cell { low, high, runs, errors })
 }
 
-/// About how far splats lie apart at each level, if all lie on the largest face of the cell's box; 0 at the
-/// finest.
+/// Approximate distance between splats at each level, by the cell's largest face; 0 at the finest.
 fn spacings(low: &[f64; 3], high: &[f64; 3], runs: &[Option<Run>]) -> Vec<f64> {
     let finest = runs.iter().position(Option::is_some);
     let face = face(low, high);
@@ -229,11 +225,11 @@ fn check_apart(manifest: &Manifest) -> std::result::Result<(), String> {
 
 /// A path that stays in the folder.
 fn inside(name: &Value) -> std::result::Result<PathBuf, String> {
-    let text = name.as_str().ok_or("has a file name that is no text")?;
+    let text = name.as_str().ok_or("has a file name that is not text")?;
     let path = Path::new(text);
     let is_inside = path.components().all(|part| matches!(part, Component::Normal(_)));
     if text.is_empty() || !is_inside || text.contains(['\\', ':']) {
-        return Err(format!("names {text:?}, which does not lie in its folder"));
+        return Err(format!("names {text:?}, which is not in its folder"));
     }
     Ok(path.to_owned())
 }

@@ -1,10 +1,10 @@
-//! Fewer splats that look alike from afar: neighbours along Morton's curve are merged, those first whose
-//! merging moves the least color.
+//! Merges splats into fewer that look alike from afar: neighbors along Morton's curve are merged, first
+//! the pairs that move the least color.
 //!
-//! The mean, spread and color of a merged splat are those of what it stands for, each weighted by its
-//! opacity times its area (as in Kerbl et al., "A Hierarchical 3D Gaussian Representation", 2024); its
-//! opacity times its area is their sum. Two are merged for the square of what they are moved times their
-//! weight, as in Ward's clustering ("Hierarchical Grouping to Optimize an Objective Function", 1963).
+//! The mean, spread and color of a merged splat are its sources' averages weighted by opacity times area
+//! (as in Kerbl et al., "A Hierarchical 3D Gaussian Representation", 2024); its opacity times its area is
+//! their sum. The cost of a merge is the weighted square of the movement, as in Ward's clustering
+//! ("Hierarchical Grouping to Optimize an Objective Function", 1963).
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
@@ -14,20 +14,20 @@ use glam::{DMat3, DQuat, DVec3};
 use super::symmetric::axes;
 use crate::splats::SplatArrays;
 
-/// Merged splats are no more opaque than this: a logit of 1 is infinite.
-const MOST_OPAQUE: f64 = 0.995;
-/// What a difference in color costs, against being apart by the root of both spreads.
+/// Maximum opacity of a merged splat: a logit of 1 is infinite.
+const OPACITY_MAX: f64 = 0.995;
+/// Cost of a color difference, relative to a distance of the root of both spreads.
 const COLOR: f64 = 4.0;
 /// The lowest coefficient of degree 0 that differs from black: color = 0.5 + coefficient / (2 sqrt(pi)).
 const BLACK: f32 = -1.772_453_9;
 /// Nothing weighs less than this.
-const LEAST: f64 = 1e-30;
+const TINY: f64 = 1e-30;
 
 /// The splats of a level.
 pub struct Merged {
-    /// In the order of those that they stand for.
+    /// In the order of their sources.
     pub splats: SplatArrays,
-    /// How far color was moved from where it was, root mean square, world units.
+    /// Root mean square distance that color was moved, world units.
     pub moved: f64,
 }
 
@@ -59,7 +59,7 @@ impl Ord for Cost {
     }
 }
 
-/// Two neighbours, and their versions when their merging had that cost.
+/// Two neighbors, and their versions when their merging had that cost.
 type Pair = (Reverse<(Cost, u32)>, u32, [u32; 2]);
 
 /// Levels of the splats, which lie in Morton's order and are finite, one for each of the falling counts.
@@ -96,7 +96,7 @@ impl Merging {
             let rotation = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());
             let along = rotation * DMat3::from_diagonal(scales);
             Cluster {
-                weight: (opacity * area(scales)).max(LEAST),
+                weight: (opacity * area(scales)).max(TINY),
                 mean: DVec3::from(splats.means[i].map(f64::from)),
                 spread: along * along.transpose(),
                 members: 1,
@@ -106,7 +106,7 @@ impl Merging {
             }
         });
         let mut sh = splats.sh.clone();
-        // What is darker than black is drawn black, and is so in a mean.
+        // Colors darker than black are drawn black, so clamp them in means.
         for row in sh.chunks_exact_mut(splats.stride()) {
             row[0] = row[0].map(|c| c.max(BLACK));
         }
@@ -188,7 +188,7 @@ impl Merging {
         self.offer(one.before);
     }
 
-    /// The clusters as splats; those that stand for one only are as they were.
+    /// The clusters as splats; clusters of one splat are unchanged.
     fn level(&self, splats: &SplatArrays) -> Merged {
         let ids: Vec<usize> =
             (0..self.clusters.len()).filter(|&i| self.clusters[i].members > 0).collect();
@@ -199,8 +199,8 @@ impl Merging {
                 continue;
             }
             let (squares, turned) = axes(cluster.spread.to_cols_array_2d());
-            let sizes = DVec3::from(squares.map(|s| s.max(LEAST).sqrt()));
-            let opaque = (cluster.weight / area(sizes)).clamp(1e-4, MOST_OPAQUE);
+            let sizes = DVec3::from(squares.map(|s| s.max(TINY).sqrt()));
+            let opaque = (cluster.weight / area(sizes)).clamp(1e-4, OPACITY_MAX);
             // `turned` has the axes as columns, in rows.
             let turn = DQuat::from_mat3(&DMat3::from_cols_array_2d(&turned).transpose());
             out.means[at] = cluster.mean.as_vec3().to_array();
@@ -211,11 +211,11 @@ impl Merging {
                 .copy_from_slice(&self.sh[i * self.stride..(i + 1) * self.stride]);
         }
         let total: f64 = ids.iter().map(|&i| self.clusters[i].weight).sum();
-        Merged { splats: out, moved: (self.moves / total.max(LEAST)).sqrt() }
+        Merged { splats: out, moved: (self.moves / total.max(TINY)).sqrt() }
     }
 }
 
-/// What two weights add to a sum of squares about their mean, by square of their distance.
+/// Increase of a sum of squares about the mean by merging two weights, per squared distance.
 fn reduced(a: f64, b: f64) -> f64 {
     a * b / (a + b)
 }

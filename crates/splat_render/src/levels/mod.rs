@@ -1,10 +1,10 @@
-//! Scenes in levels of detail, so that what is larger than memory can be looked at: PlayCanvas's streamed
-//! SOG, version 1.
+//! Scenes in levels of detail, for viewing scenes larger than memory: PlayCanvas's streamed SOG, version
+//! 1.
 //!
 //! A folder has a `lod-meta.json` ([`Manifest`]) and SOGs in folders. Space is split into cells; each has
-//! its splats at several levels, 0 the finest. [`write_levels`] makes such a folder in bounded memory,
-//! [`choose`] says which level of each cell a camera needs within a budget of splats, and [`Resident`]
-//! holds those that were read.
+//! its splats at several levels, 0 the finest. [`write_levels`] writes such a folder in bounded memory,
+//! [`choose`] selects the level of each cell for a camera within a budget of splats, and [`Resident`]
+//! holds the loaded splats.
 
 mod cells;
 mod choice;

@@ -9,7 +9,7 @@ use crate::error::{Error, Result};
 use crate::io::{SplatFile, is_drawn, read_splats};
 use crate::splats::SplatArrays;
 
-/// What is there to draw.
+/// The splats to draw.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Drawn {
     /// The splats.
@@ -34,10 +34,7 @@ pub struct Resident {
 }
 
 impl Resident {
-    /// Nothing but the environment, which is drawn always.
-    ///
-    /// # Errors
-    /// [`Error::File`]: it cannot be read; [`Error::Argument`]: the budget is less than it takes.
+    /// Starts with the environment, which is always drawn. Fails if the budget is too small for it.
     pub fn new(manifest: &Manifest, budget: usize) -> Result<Self> {
         let mut out = Self { budget, ..Self::default() };
         if let Some(name) = &manifest.environment {
@@ -45,7 +42,7 @@ impl Resident {
             if file.splats.len() >= budget {
                 let n = file.splats.len();
                 let what =
-                    format!("of {budget} splats has no room beside the {n} that are always drawn");
+                    format!("of {budget} splats is no more than the {n} that are always drawn");
                 return Err(Error::argument("budget", format!("{what}; give more")));
             }
             out.environment = file.splats;
@@ -56,12 +53,12 @@ impl Resident {
         Ok(out)
     }
 
-    /// What cells may take.
+    /// Splats that cells may take.
     pub fn room(&self) -> usize {
         self.budget - self.environment.len()
     }
 
-    /// The files to read for a choice: those of coarsest levels first, then by importance.
+    /// The files to read for a choice: files of coarsest levels first, then by importance.
     pub fn missing(&self, manifest: &Manifest, choice: &Choice) -> Vec<usize> {
         let (mut seen, mut out) = (BTreeSet::new(), Vec::new());
         for key in wanted(manifest, choice) {
@@ -76,10 +73,7 @@ impl Resident {
         out
     }
 
-    /// Keeps what a choice wants of a file's splats. What it does not want goes as room is needed.
-    ///
-    /// # Errors
-    /// Those of [`read_file`].
+    /// Keeps the splats of a file that a choice needs; others are dropped as room is required.
     pub fn load(&mut self, manifest: &Manifest, choice: &Choice, file: usize) -> Result<()> {
         let read = read_file(manifest, file)?;
         self.keep(manifest, choice, file, &read);
@@ -141,19 +135,16 @@ fn wanted(manifest: &Manifest, choice: &Choice) -> Vec<(usize, usize)> {
     order.iter().filter_map(coarsest).chain(order.iter().filter_map(chosen)).collect()
 }
 
-/// The splats of a file, which has as many as the manifest says.
-///
-/// # Errors
-/// [`Error::File`] that names it: it cannot be read, or holds more or fewer.
+/// Reads a file and checks its number of splats against the manifest.
 fn read_file(manifest: &Manifest, file: usize) -> Result<SplatFile> {
     let path = manifest.folder.join(&manifest.files[file]);
     let mut read = read_splats(&path)?.file;
     let (there, said) = (read.splats.len(), manifest.size_of(file));
     if there != said {
-        let what = format!("holds {there} splats where {} says {said}", super::INDEX);
+        let what = format!("holds {there} splats, but {} says {said}", super::INDEX);
         return Err(Error::file(&path, format!("{what}; write the levels again")));
     }
-    // Cells keep their rows: what no renderer draws becomes faint and of no size instead of going.
+    // Cells keep their rows: invalid splats become faint and tiny instead of being removed.
     for i in 0..there {
         if !is_drawn(&read.splats, i) {
             read.splats.clear(i);
@@ -169,7 +160,7 @@ fn rows(splats: &SplatArrays, run: &Run) -> SplatArrays {
     splats.select(&(run.offset..run.offset + run.count).collect::<Vec<_>>())
 }
 
-/// All parts one after the other, with the highest SH degree of them.
+/// All parts concatenated, at their highest SH degree.
 fn joined(parts: &[&SplatArrays]) -> SplatArrays {
     let degree = parts.iter().map(|part| part.sh_degree).max().unwrap_or(0);
     let mut out = SplatArrays { sh_degree: degree, ..SplatArrays::default() };
@@ -196,11 +187,8 @@ fn joined(parts: &[&SplatArrays]) -> SplatArrays {
     out
 }
 
-/// The finest level of which all cells together have no more splats than a budget, whole; the coarsest if
-/// there is none. For viewers that do not draw by distance.
-///
-/// # Errors
-/// [`Error::File`]: a file cannot be read, or even the coarsest level has more splats than the budget.
+/// Reads the finest level whose cells together fit a budget of splats; fails if even the coarsest does
+/// not. For viewers that do not choose levels by distance.
 pub fn read_within(path: &Path, budget: usize) -> Result<(SplatFile, usize)> {
     let manifest = Manifest::read(path)?;
     let mut resident = Resident::new(&manifest, budget.max(1))?;

@@ -35,7 +35,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn axes_and_values_make_the_matrix_again() {
+    fn eigenvectors_and_eigenvalues_give_the_matrix() {
         for a in [
             [[2.0, 0.3, -0.7], [0.3, 1.0, 0.2], [-0.7, 0.2, 3.0]],
             [[1.0, 1.0, 1.0]; 3],

@@ -1,8 +1,8 @@
-//! Writes a scene in levels of detail, in memory that does not grow with it.
+//! Writes a scene in levels of detail, in bounded memory.
 //!
-//! The file is read twice. First, every so manieth position says where space is split into cells. Then
-//! each splat goes to a file of its cell, and the cells are merged one after the other. Of a level, cells
-//! that follow each other share a SOG until it is as large as a cell.
+//! The file is read twice: first a sample of positions decides the split of space into cells; then each
+//! splat is written to its cell's file, and the cells are merged one by one. Consecutive cells of a level
+//! share a SOG until it is as large as a cell.
 
 use std::fs::{File, OpenOptions};
 use std::io::{Read, Write};
@@ -18,9 +18,9 @@ use crate::error::{Error, Result};
 use crate::io::{SOG_META, SplatRows, cut_degree, is_drawn, morton_order, write_sog_folder};
 use crate::splats::SplatArrays;
 
-/// Splats of a level by those of the next finer one.
+/// Ratio of the number of splats between two levels.
 const QUARTER: usize = 4;
-/// Positions that tell where to split space.
+/// Number of sampled positions that decide the split.
 const SAMPLES: usize = 1 << 20;
 /// Splats that are read at once, and that wait to be written to their cells' files.
 const BATCH: usize = 1 << 14;
@@ -28,7 +28,7 @@ const WAITING: usize = 1 << 17;
 /// Highest SH degree of SOG.
 const DEGREE: u32 = 3;
 
-/// What was written.
+/// Result of [`write_levels`].
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LevelsWritten {
     /// Splats of each level, 0 the finest.
@@ -37,17 +37,13 @@ pub struct LevelsWritten {
     pub cells: usize,
     /// Number of SOGs.
     pub files: usize,
-    /// What was left out.
+    /// Notes about omitted splats.
     pub notes: Vec<String>,
 }
 
-/// Writes the scene of a file into a folder, which is there and empty: `levels` of them, each with a
-/// quarter of the splats of the next finer one, in cells of at most about `per_cell` splats. None, with the
-/// folder half written, once `goes_on`, which is asked now and then, says no.
-///
-/// # Errors
-/// [`Error::Argument`]: a number cannot be used; [`Error::File`]: a file cannot be read or written, or has
-/// no splats.
+/// Writes the scene of a file into an existing, empty folder: `levels` levels, each with a quarter of the
+/// splats of the next finer one, in cells of about `per_cell` splats. None, with the folder half written,
+/// once `goes_on` returns false.
 pub fn write_levels(
     source: &Path,
     folder: &Path,
@@ -132,10 +128,10 @@ pub fn write_levels(
     std::fs::write(&path, written(&manifest, &tree, &cells)).map_err(|e| unwritable(&path, &e))?;
     let mut notes = Vec::new();
     if left_out > 0 {
-        notes.push(format!("{left_out} splats that no renderer draws are left out."));
+        notes.push(format!("{left_out} splats that cannot be drawn are left out."));
     }
     if rows.sh_degree > DEGREE {
-        notes.push(format!("SOG holds spherical harmonics up to degree {DEGREE}."));
+        notes.push(format!("SOG has spherical harmonics up to degree {DEGREE}."));
     }
     Ok(Some(LevelsWritten {
         counts: manifest.counts(),
@@ -154,7 +150,7 @@ fn step(rows: &SplatRows) -> usize {
     rows.count.div_ceil(SAMPLES).max(1)
 }
 
-/// The finite ones of these positions; None where it was told to stop.
+/// The finite positions; None if canceled.
 fn sample(
     rows: &mut SplatRows,
     goes_on: &mut dyn FnMut() -> bool,

@@ -1,4 +1,4 @@
-//! adam: one optimiser step of all parameters, the regularisers' pull, the exploration noise.
+//! adam: one optimizer step of all parameters, the regularizers' pull, the exploration noise.
 
 use glam::{DMat3, DQuat, DVec3};
 
@@ -16,7 +16,7 @@ fn update(value: &mut f64, moments: [&mut f64; 2], gradient: f64, rate: f32, bia
     *value -= f64::from(rate) * (*first * bias[0]) / ((*second * bias[1]).sqrt() + epsilon);
 }
 
-/// Where exploration takes splat `i`'s centre (3DGS-MCMC, eq. 8); None where it stays.
+/// New center of splat `i` after exploration (3DGS-MCMC, eq. 8); None if it does not move.
 fn explored(state: &AdamState<f64>, i: usize, step: &AdamStep) -> Option<DVec3> {
     let splats = &state.splats;
     let opacity = 1.0 / (1.0 + (-splats.opacities[i]).exp());

@@ -1,8 +1,8 @@
-//! exposure and exposure_backward: a picture's colours as a photo of some gain and offset has them.
+//! exposure and exposure_backward: a picture's colors as a photo of some gain and offset has them.
 
 use crate::stages::{Exposure, ExposureGradients, Image};
 
-/// A pixel's colour before it is cut to what a photo holds.
+/// A pixel's color before the clamp to 0..=1.
 fn raw(exposure: &Exposure<f64>, color: [f64; 3], t: f64) -> [f64; 3] {
     let Exposure { gain, offset, background } = *exposure;
     std::array::from_fn(|c| match background {
@@ -27,7 +27,7 @@ pub(super) fn exposure_backward(
     {
         let raw = raw(exposure, color, transmittance);
         let v: [f64; 3] = std::array::from_fn(|c| Exposure::passed(raw[c], v[c]));
-        // What of the pixel the exposure leaves as it is.
+        // The part of the pixel that the exposure does not change.
         let (t, b) = exposure.background.map_or((0.0, [0.0; 3]), |b| (transmittance, b));
         let mut v_t = 0.0;
         for c in 0..3 {

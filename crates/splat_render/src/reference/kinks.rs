@@ -1,5 +1,4 @@
-//! Which discrete decisions a render takes. Between two parameter values with the same decisions the
-//! picture is smooth, so central differences are valid exactly there.
+//! The discrete decisions of a render: central differences are valid between equal decisions.
 
 use std::hash::{DefaultHasher, Hash, Hasher};
 
@@ -9,8 +8,7 @@ use crate::camera::Camera;
 use crate::constants::TRANSMITTANCE_MIN;
 use crate::stages::{Colors, ProjectOptions, Projected, SplatParams};
 
-/// Hash of every decision: culling, Jacobian limits, colour's cut at zero, depth order, pairs that
-/// contribute, alphas that are capped, where each pixel stops.
+/// Hash of every decision: culling, clamps, depth order, contributing pairs, early stops.
 pub fn decisions(
     splats: &SplatParams<'_, f64>,
     camera: &Camera,

@@ -16,8 +16,7 @@ fn photo(target: &Target, background: [f64; 3]) -> Vec<[f64; 3]> {
         .collect()
 }
 
-/// Pixels that the window around a pixel meets, each with its weight; there is nothing beyond the
-/// picture.
+/// The pixels of the window around a pixel, within the picture, with their weights.
 fn window(width: usize, height: usize, pixel: usize) -> impl Iterator<Item = (usize, f64)> {
     let (half, side) = (SSIM_WINDOW.len() / 2, SSIM_WINDOW.len());
     let (row, column) = (pixel / width, pixel % width);
@@ -47,7 +46,7 @@ pub(super) fn loss(
         for c in 0..3 {
             let (x, y) = (image.color[pixel][c], photo[pixel][c]);
             out.value += scale * w * (1.0 - s) * (x - y).abs();
-            // The distance has no slope where it is 0.
+            // |x - y| has slope 0 at 0.
             let sign = if x == y { 0.0 } else { (x - y).signum() };
             out.v_color[pixel][c] += scale * w * (1.0 - s) * sign;
 

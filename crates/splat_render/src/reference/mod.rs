@@ -1,5 +1,4 @@
-//! The oracle: f64, short, plain, no tiles, no tricks. Every other implementation is tested
-//! against it, stage by stage.
+//! The reference: f64, short, plain, untiled. All implementations are tested against it.
 
 mod adam;
 mod depth_loss;
@@ -18,7 +17,7 @@ use crate::camera::Camera;
 use crate::error::Result;
 use crate::stages::{
     AdamState, AdamStep, DepthLoss, Exposure, ExposureGradients, Image, ImageGradients, Loss,
-    ProjectOptions, Projected, ProjectedGradients, SplatGradients, SplatParams, Stages, check,
+    ProjectOptions, Projected, ProjectedGradients, SplatGradients, SplatParams, Stages,
 };
 use crate::target::{Target, TargetDepth};
 
@@ -27,34 +26,35 @@ use crate::target::{Target, TargetDepth};
 pub struct Reference;
 
 impl Stages<f64> for Reference {
-    fn project(
+    fn project_unchecked(
         &self,
         splats: &SplatParams<'_, f64>,
         camera: &Camera,
         options: &ProjectOptions,
     ) -> Result<Projected<f64>> {
-        check::project(splats, camera, options)?;
         Ok(project::project(splats, camera, options))
     }
 
-    fn rasterize(&self, projected: &Projected<f64>, background: [f64; 3]) -> Result<Image<f64>> {
-        projected.validate()?;
-        Ok(rasterize::rasterize(projected, background))
-    }
-
-    fn rasterize_backward(
+    fn rasterize_unchecked(
         &self,
         projected: &Projected<f64>,
         background: [f64; 3],
-        image: &Image<f64>,
+    ) -> Result<Image<f64>> {
+        Ok(rasterize::rasterize(projected, background))
+    }
+
+    fn rasterize_backward_unchecked(
+        &self,
+        projected: &Projected<f64>,
+        background: [f64; 3],
+        _image: &Image<f64>,
         v_image: &ImageGradients<f64>,
         absolute: bool,
     ) -> Result<ProjectedGradients<f64>> {
-        check::rasterize_backward(projected, image, v_image)?;
         Ok(rasterize_backward::rasterize_backward(projected, background, v_image, absolute))
     }
 
-    fn project_backward(
+    fn project_backward_unchecked(
         &self,
         splats: &SplatParams<'_, f64>,
         camera: &Camera,
@@ -62,48 +62,50 @@ impl Stages<f64> for Reference {
         projected: &Projected<f64>,
         v_projected: &ProjectedGradients<f64>,
     ) -> Result<SplatGradients<f64>> {
-        check::project_backward(splats, camera, options, projected, v_projected)?;
         Ok(project_backward::project_backward(splats, camera, options, projected, v_projected))
     }
 
-    fn exposure(&self, image: &Image<f64>, exposure: &Exposure<f64>) -> Result<Vec<[f64; 3]>> {
-        check::exposure(image, exposure)?;
+    fn exposure_unchecked(
+        &self,
+        image: &Image<f64>,
+        exposure: &Exposure<f64>,
+    ) -> Result<Vec<[f64; 3]>> {
         Ok(exposure::exposure(image, exposure))
     }
 
-    fn exposure_backward(
+    fn exposure_backward_unchecked(
         &self,
         image: &Image<f64>,
         exposure: &Exposure<f64>,
         v_corrected: &[[f64; 3]],
     ) -> Result<ExposureGradients<f64>> {
-        check::exposure_backward(image, exposure, v_corrected)?;
         Ok(exposure::exposure_backward(image, exposure, v_corrected))
     }
 
-    fn loss(
+    fn loss_unchecked(
         &self,
         image: &Image<f64>,
         target: &Target,
         background: [f64; 3],
         ssim_weight: f32,
     ) -> Result<Loss<f64>> {
-        check::loss(image, target, ssim_weight)?;
         Ok(loss::loss(image, target, background, ssim_weight))
     }
 
-    fn depth_loss(&self, image: &Image<f64>, target: &TargetDepth) -> Result<DepthLoss<f64>> {
-        check::depth_loss(image, target)?;
+    fn depth_loss_unchecked(
+        &self,
+        image: &Image<f64>,
+        target: &TargetDepth,
+    ) -> Result<DepthLoss<f64>> {
         Ok(depth_loss::depth_loss(image, target))
     }
 
-    fn adam(
+    fn adam_unchecked(
         &self,
         state: &mut AdamState<f64>,
         gradients: &SplatGradients<f64>,
         step: &AdamStep,
     ) -> Result<()> {
-        check::adam(state, gradients, step)?;
         adam::adam(state, gradients, step);
         Ok(())
     }

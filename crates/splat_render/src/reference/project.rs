@@ -7,15 +7,15 @@ use crate::constants::{ALPHA_MIN, QUAT_NORM2_MIN};
 use crate::sh;
 use crate::stages::{Colors, ProjectOptions, Projected, SplatParams};
 
-/// What both directions of the stage need of one splat.
+/// Quantities of one splat that forward and backward share.
 pub(super) struct Geometry {
-    /// Camera-space centre.
+    /// Camera-space center.
     pub t: DVec3,
     /// Splat axes in the world.
     pub axes: DMat3,
     /// Norm of the quaternion as given.
     pub quat_norm: f64,
-    /// Normalised quaternion (w, x, y, z).
+    /// Normalized quaternion (w, x, y, z).
     pub quat: [f64; 4],
     /// Standard deviations along the axes.
     pub scales: DVec3,
@@ -30,7 +30,7 @@ pub(super) struct Geometry {
     pub m: [DVec3; 2],
     /// Upper-triangular factor of the conic.
     pub factor: [f64; 3],
-    /// What the opacity is multiplied by; 1 if not antialiased.
+    /// Factor of the opacity; 1 if not antialiased.
     pub compensation: f64,
 }
 
@@ -60,7 +60,7 @@ pub(super) fn geometry(
     let quat_norm = norm2.sqrt();
     let quat = [w / quat_norm, x / quat_norm, y / quat_norm, z / quat_norm];
     let axes = DMat3::from_quat(DQuat::from_xyzw(quat[1], quat[2], quat[3], quat[0]));
-    // A logit of +inf or a log-scale of -inf is poisoned, though what it stands for is finite.
+    // A logit of +inf or a log-scale of -inf counts as invalid, although its opacity or scale is finite.
     if !splats.opacities[i].is_finite() {
         return None;
     }
@@ -90,15 +90,14 @@ pub(super) fn geometry(
     Some(Geometry { t, axes, quat_norm, quat, scales, xz, yz, inside, a, m, factor, compensation })
 }
 
-/// Unit view direction in the world and the length it was normalised by.
+/// Unit view direction in the world and the length it was normalized by.
 pub(super) fn direction(camera: &Camera, t: DVec3) -> (DVec3, f64) {
-    // R^T t is the vector from the camera's centre to the mean, without the cancellation of
-    // subtracting two far-away points.
+    // R^T t is the vector from center to mean, without cancellation far from the origin.
     let along = camera.rotation().transpose() * t;
     (along / along.length(), along.length())
 }
 
-/// SH colour before the cut at zero.
+/// SH color before the cut at zero.
 pub(super) fn sh_color(degree: u32, coeffs: &[[f64; 3]], dir: DVec3) -> DVec3 {
     let basis = sh::basis(degree, dir.to_array());
     (0..sh::coeffs(degree)).map(|k| basis[k] * DVec3::from(coeffs[k])).sum::<DVec3>() + 0.5
@@ -124,7 +123,7 @@ pub(super) fn project(
             camera.fy * g.t.y / g.t.z + camera.cy,
         );
         let size = DVec2::new(f64::from(camera.width), f64::from(camera.height));
-        // No pixel centre can be reached.
+        // No pixel center can be reached.
         if (center + radii).cmplt(DVec2::ZERO).any() || (center - radii).cmpgt(size).any() {
             continue;
         }
@@ -133,8 +132,7 @@ pub(super) fn project(
             Colors::Sh { degree, stride, coeffs } => {
                 let dir = direction(camera, g.t).0;
                 let color = sh_color(degree, &coeffs[i * stride..], dir);
-                // Before the cut at zero, which would hide a poisoned coefficient here and let it
-                // out in the gradients.
+                // Before the clamp at zero, which would hide an invalid coefficient.
                 if !color.is_finite() {
                     continue;
                 }

@@ -57,7 +57,7 @@ pub(super) fn project_backward(
         let (x, y, z) = (g.t.x, g.t.y, g.t.z);
         let mut v_t = DVec3::ZERO;
 
-        // Colour and, through the view direction, t and the rotation.
+        // Color and, through the view direction, t and the rotation.
         let v_color = DVec3::from(v_projected.v_colors[i]);
         match splats.colors {
             Colors::Direct(_) => out.v_colors[i] = v_color.to_array(),
@@ -114,7 +114,7 @@ pub(super) fn project_backward(
         let v_scales = v_m[0] * b[0] + v_m[1] * b[1];
         out.v_scales[i] = if splats.raw { v_scales * g.scales } else { v_scales }.to_array();
 
-        // Axes -> quaternion, through its normalisation.
+        // Axes -> quaternion, through its normalization.
         let v_axes = outer(g.a[0], v_b[0]) + outer(g.a[1], v_b[1]);
         let v_unit = quat_gradient(g.quat, v_axes);
         let along: f64 = (0..4).map(|k| v_unit[k] * g.quat[k]).sum();
@@ -130,7 +130,7 @@ pub(super) fn project_backward(
         let v_row_z = -v_a[0] * (fx * g.xz / z) - v_a[1] * (fy * g.yz / z);
         v_rotation += DMat3::from_cols(v_row_x, v_row_y, v_row_z).transpose();
 
-        // J, with x/z and y/z held where they are limited.
+        // J, with clamped x/z and y/z held constant.
         v_fx += v_j00 / z - v_j02 * g.xz / z;
         v_fy += v_j11 / z - v_j12 * g.yz / z;
         v_t.z += -v_j00 * fx / (z * z) + v_j02 * fx * g.xz / (z * z) - v_j11 * fy / (z * z)
@@ -152,7 +152,7 @@ pub(super) fn project_backward(
             v_cy -= v_yz / fy;
         }
 
-        // Centre and depth.
+        // Center and depth.
         let [v_u, v_v] = v_projected.v_means2d[i];
         v_fx += v_u * x / z;
         v_fy += v_v * y / z;

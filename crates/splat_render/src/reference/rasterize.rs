@@ -12,7 +12,7 @@ pub(super) fn order(projected: &Projected<f64>) -> Vec<usize> {
 
 /// One splat's meeting with one pixel.
 pub(super) struct Pair {
-    /// Offset of the pixel's centre from the splat's.
+    /// Offset of the pixel's center from the splat's.
     pub dx: f64,
     pub dy: f64,
     /// The same, whitened.
@@ -26,7 +26,7 @@ pub(super) struct Pair {
     pub capped: bool,
 }
 
-/// None where the pair contributes nothing.
+/// None if the pair contributes nothing.
 pub(super) fn pair(projected: &Projected<f64>, i: usize, x: u32, y: u32) -> Option<Pair> {
     let [mx, my] = projected.means2d[i];
     let [p, q, r] = projected.factors[i];
@@ -83,9 +83,9 @@ pub(super) fn rasterize(projected: &Projected<f64>, background: [f64; 3]) -> Ima
     out
 }
 
-/// Pixels at which an f32 implementation may rightly differ from this one: a pair there lies within
-/// `alpha_band` (relative) of the alpha threshold, or the transmittance within 1e-4 of its own, or
-/// two neighbours' depths within 1e-6 of each other.
+/// Pixels at which a correct f32 implementation may differ from this one: a pair is within `alpha_band`
+/// (relative) of the alpha threshold, the transmittance within 1e-4 of its threshold, or two neighbors'
+/// depths within 1e-6 of each other.
 pub fn band_pixels(projected: &Projected<f64>, alpha_band: f64) -> Vec<bool> {
     let (w, h) = (projected.width, projected.height);
     let ids = order(projected);

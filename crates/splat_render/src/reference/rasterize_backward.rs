@@ -38,7 +38,7 @@ pub(super) fn rasterize_backward(
             for c in 0..3 {
                 out.v_background[c] += t * v_color[c];
             }
-            // Back to front: what lies behind the current splat, dotted with the gradients.
+            // Back to front: the color behind the current splat, dotted with the gradients.
             let mut behind = t * (dot(background, v_color) - v_alpha_out);
             for (i, t, pair) in pairs.into_iter().rev() {
                 let weight = t * pair.alpha;

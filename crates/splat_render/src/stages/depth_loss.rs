@@ -1,13 +1,13 @@
-//! How far a picture's depth is from that of a photo.
+//! The depth loss of a pixel.
 
 use num_traits::Float;
 
 use crate::constants::DEPTH_ALPHA;
 
-/// Loss of a picture's depth against that of a photo, and its gradients.
+/// Loss of a picture's depth against a photo's, and its gradients.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct DepthLoss<T> {
-    /// The loss; 0 where no depth is known.
+    /// The loss; 0 without known depths.
     pub value: T,
     /// `[H * W]` with respect to the picture's alpha.
     pub v_alpha: Vec<T>,
@@ -15,9 +15,9 @@ pub struct DepthLoss<T> {
     pub v_depth: Vec<T>,
 }
 
-/// A pixel's loss `2 |D - A z| / (D + A z)` with its gradients with respect to A and D, for the
-/// picture's alpha A, its accumulated depth D and the photo's depth z; 0 where the picture is too
-/// clear to have a depth.
+/// A pixel's loss `2 |D - A z| / (D + A z)` with its gradients with respect to A and D, for the picture's
+/// alpha A, its accumulated depth D and the photo's depth z; 0 if the picture is too transparent to have
+/// a depth.
 #[inline(always)]
 pub(crate) fn pixel<T: Float>(alpha: T, depth: T, z: T) -> [T; 3] {
     let (zero, two) = (T::zero(), T::one() + T::one());

@@ -1,20 +1,18 @@
-//! What a photo's exposure and white balance make of a rendered picture.
+//! Exposure and white balance of a photo, applied to a rendered picture.
 
 use num_traits::Float;
 
 use crate::error::{Error, Result};
 
-/// Gain and offset per channel of one photo. In a photo without alpha a picture's colours become
-/// `gain * color + offset`. In one with alpha the camera saw what is before the background alone:
-/// with T the picture's transmittance and b its background, colours become
-/// `gain * (color - T b) + offset * (1 - T) + T b`.
+/// Gain and offset per channel of one photo. For a photo without alpha, colors become `gain * color +
+/// offset`. In a photo with alpha, only the foreground was exposed: with T the picture's transmittance
+/// and b its background, colors become `gain * (color - T b) + offset * (1 - T) + T b`.
 ///
-/// What comes out is cut to 0..=1, which is all that a photo holds: where a photo is white, a colour
-/// may be any that is white in it. Back goes what brings a colour that was cut closer to what a photo
-/// holds, and nothing that takes it further away.
+/// The result is clamped to 0..=1, the range of photos: white pixels of a photo match any brighter color.
+/// Gradients pass if they move a clamped color back toward the range, and are dropped if they would move
+/// it further out.
 ///
-/// Colours are encoded as photos are (sRGB), 1 at the brightest: one stop is a gain of about
-/// 2^(1/2.2).
+/// Colors are encoded as in photos (sRGB), 1 at the brightest: one stop is a gain of about 2^(1/2.2).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Exposure<T> {
     /// Factor of R, G and B.
@@ -31,14 +29,13 @@ impl<T: Float> Exposure<T> {
         Self { gain: [T::one(); 3], offset: [T::zero(); 3], background: None }
     }
 
-    /// How a colour grows with the transmittance: b - gain b - offset, 0 where there is no
-    /// background to keep.
+    /// Change of a color per unit of transmittance: b - gain b - offset, 0 without a background.
     pub(crate) fn behind(&self) -> [T; 3] {
         let Some(background) = self.background else { return [T::zero(); 3] };
         std::array::from_fn(|c| background[c] - self.gain[c] * background[c] - self.offset[c])
     }
 
-    /// What of a corrected colour's gradient `v` goes back, where the colour was `raw` before the cut.
+    /// The part of a corrected color's gradient `v` that passes the clamp; `raw` is the color before it.
     #[inline(always)]
     pub(crate) fn passed(raw: T, v: T) -> T {
         let leaves = (raw > T::one() && v < T::zero()) || (raw < T::zero() && v > T::zero());
@@ -46,9 +43,6 @@ impl<T: Float> Exposure<T> {
     }
 
     /// Checks that all values are finite.
-    ///
-    /// # Errors
-    /// [`Error::Argument`] that names the value.
     pub fn validate(&self) -> Result<()> {
         let background = self.background.unwrap_or([T::zero(); 3]);
         for (name, values) in
@@ -65,7 +59,7 @@ impl<T: Float> Exposure<T> {
 /// Gradients of a loss of the corrected picture.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ExposureGradients<T> {
-    /// `[H * W]` with respect to the picture's colours.
+    /// `[H * W]` with respect to the picture's colors.
     pub v_color: Vec<[T; 3]>,
     /// `[H * W]` with respect to the picture's alpha; zeros in a photo without alpha.
     pub v_alpha: Vec<T>,

@@ -1,24 +1,25 @@
-//! What passes between the stages, and the trait that the implementations share.
+//! The data that passes between the stages, and [`Stages`], the trait of all implementations.
 //!
-//! All arrays are on the host; an implementation may keep its own copies where its kernels run.
-//! `T` is f64 in the reference and f32 elsewhere.
+//! All arrays are on the host; an implementation may copy them to its device. `T` is f64 in the reference
+//! and f32 elsewhere.
 
-pub(crate) mod check;
 mod depth_loss;
 mod exposure;
+mod interface;
 
-use num_traits::Float;
+/// The trait of number types that [`Stages`] takes: f32 and f64.
+pub use num_traits::Float;
 
-use crate::camera::{Camera, check_size};
+use crate::camera::check_size;
 use crate::constants::{ADAM, BLUR, FAR, NEAR};
 use crate::error::{Error, Result};
 use crate::splats::SplatArrays;
-use crate::target::{Target, TargetDepth};
 
 pub use crate::splats::{Colors, SplatParams};
 pub use depth_loss::DepthLoss;
 pub(crate) use depth_loss::pixel as depth_pixel;
 pub use exposure::{Exposure, ExposureGradients};
+pub use interface::Stages;
 
 /// Checks that every named length is `expected`; `unit` goes between the two numbers of the error.
 fn check_lengths(lengths: &[(&str, usize)], expected: usize, unit: &str) -> Result<()> {
@@ -39,9 +40,9 @@ pub struct ProjectOptions {
     pub far: f32,
     /// Variance in px^2 added to both axes of the 2D covariance.
     pub blur: f32,
-    /// Whether opacities are lowered by what the blur adds to a splat's area, so that a splat
-    /// seen small keeps its weight in the picture: times sqrt(det S / det(S + blur I)), S the 2D
-    /// covariance without blur (the 2D filter of Mip-Splatting, Yu et al. 2024, section 4.2).
+    /// Whether opacities are lowered to compensate for the area that the blur adds, so that small splats
+    /// keep their weight in the picture: times sqrt(det S / det(S + blur I)), S the 2D covariance without
+    /// blur (the 2D filter of Mip-Splatting, Yu et al. 2024, section 4.2).
     pub antialiased: bool,
 }
 
@@ -52,17 +53,13 @@ impl Default for ProjectOptions {
 }
 
 impl ProjectOptions {
-    /// Checks every setting: `near` finite and not negative, `far` beyond it, `blur` finite and not
-    /// negative.
-    ///
-    /// # Errors
-    /// [`Error::Argument`] that names the setting.
+    /// Checks every setting.
     pub fn validate(&self) -> Result<()> {
-        if !(self.near.is_finite() && self.near >= 0.0) {
-            return Err(Error::argument(
-                "near",
-                format!("must be finite and not negative, got {}", self.near),
-            ));
+        for (name, value) in [("near", self.near), ("blur", self.blur)] {
+            if !(value.is_finite() && value >= 0.0) {
+                let reason = format!("must be finite and not negative, got {value}");
+                return Err(Error::argument(name, reason));
+            }
         }
         if self.far.is_nan() || self.far <= self.near {
             return Err(Error::argument(
@@ -70,17 +67,10 @@ impl ProjectOptions {
                 format!("must exceed near, {}, got {}", self.near, self.far),
             ));
         }
-        if !(self.blur.is_finite() && self.blur >= 0.0) {
-            return Err(Error::argument(
-                "blur",
-                format!("must be finite and not negative, got {}", self.blur),
-            ));
-        }
         Ok(())
     }
 
-    /// The least depth that is drawn. It is above 0 even where `near` is 0: a splat at the camera's
-    /// plane or behind it has no picture.
+    /// Minimum depth of drawn splats; above 0, since splats in the camera's plane have no projection.
     pub fn nearest(&self) -> f32 {
         self.near.max(f32::MIN_POSITIVE)
     }
@@ -93,16 +83,16 @@ pub struct Projected<T> {
     pub width: u32,
     /// Image height in pixels.
     pub height: u32,
-    /// Centres in pixels.
+    /// Centers in pixels.
     pub means2d: Vec<[T; 2]>,
     /// Upper-triangular factor (p, q, r) of the conic: u = p dx + q dy, v = r dy,
-    /// sigma = (u^2 + v^2) / 2, with (dx, dy) = pixel centre - mean2d.
+    /// sigma = (u^2 + v^2) / 2, with (dx, dy) = pixel center - mean2d.
     pub factors: Vec<[T; 3]>,
     /// Camera-space z.
     pub depths: Vec<T>,
-    /// Colours.
+    /// Colors.
     pub colors: Vec<[T; 3]>,
-    /// Opacities in 0..1, lowered where the project stage was told to (antialiased).
+    /// Opacities in 0..1, including the antialiasing factor.
     pub opacities: Vec<T>,
     /// Half-sides in px of the box outside which alpha < `ALPHA_MIN`.
     pub radii: Vec<[T; 2]>,
@@ -123,9 +113,10 @@ impl<T: Copy + Default> Projected<T> {
             radii: vec![[z; 2]; n],
         }
     }
+}
 
-    /// Checks what a caller may have put together by hand: the size, and that all arrays are of
-    /// one length.
+impl<T> Projected<T> {
+    /// Checks the size, and that all arrays have the same length.
     pub fn validate(&self) -> Result<()> {
         check_size(self.width, self.height)?;
         let lengths = [
@@ -135,7 +126,7 @@ impl<T: Copy + Default> Projected<T> {
             ("opacities", self.opacities.len()),
             ("radii", self.radii.len()),
         ];
-        check_lengths(&lengths, self.len(), "rows where means2d has")
+        check_lengths(&lengths, self.len(), "rows, but means2d has")
     }
 
     /// Number of splats, culled ones included.
@@ -192,16 +183,13 @@ pub struct ImageGradients<T> {
 
 impl<T> ImageGradients<T> {
     /// Checks that these and `image` have the size of the picture of `projected`.
-    ///
-    /// # Errors
-    /// [`Error::Argument`] that names the array.
     pub fn validate(&self, projected: &Projected<T>, image: &Image<T>) -> Result<()> {
         let size = (projected.width, projected.height);
         if (image.width, image.height) != size {
             return Err(Error::argument(
                 "image",
                 format!(
-                    "is {} x {} where the picture is {} x {}",
+                    "is {} x {}, but the picture is {} x {}",
                     image.width, image.height, size.0, size.1
                 ),
             ));
@@ -216,7 +204,7 @@ impl<T> ImageGradients<T> {
             ("v_depth", self.v_depth.len()),
         ];
         let pixels = projected.width as usize * projected.height as usize;
-        check_lengths(&lengths, pixels, "pixels where the picture has")
+        check_lengths(&lengths, pixels, "pixels, but the picture has")
     }
 }
 
@@ -233,15 +221,15 @@ pub struct ProjectedGradients<T> {
     pub v_colors: Vec<[T; 3]>,
     /// `[N]`
     pub v_opacities: Vec<T>,
-    /// Gradient of the background colour.
+    /// Gradient of the background color.
     pub v_background: [T; 3],
-    /// `[N]` sums over pixels of the absolute value of each pixel's part of `v_means2d`, where
-    /// asked for (AbsGS, Ye et al. 2024; gsplat's `absgrad`); project_backward does not read it.
+    /// `[N]` sums over pixels of the absolute value of each pixel's part of `v_means2d`, on request
+    /// (AbsGS, Ye et al. 2024; gsplat's `absgrad`); project_backward does not read it.
     pub v_means2d_absolute: Option<Vec<[T; 2]>>,
 }
 
 impl<T> ProjectedGradients<T> {
-    /// Checks that these and the `projected` splats are as many as the splats.
+    /// Checks the lengths of the gradients and of the `projected` splats against the number of splats.
     pub fn validate(&self, splats: usize, projected: usize) -> Result<()> {
         let lengths = [
             ("projected", projected),
@@ -251,7 +239,7 @@ impl<T> ProjectedGradients<T> {
             ("v_colors", self.v_colors.len()),
             ("v_opacities", self.v_opacities.len()),
         ];
-        check_lengths(&lengths, splats, "rows where means has")
+        check_lengths(&lengths, splats, "rows, but means has")
     }
 }
 
@@ -276,13 +264,13 @@ impl<T: Copy + Default> ProjectedGradients<T> {
 pub struct SplatGradients<T> {
     /// `[N]`
     pub v_means: Vec<[T; 3]>,
-    /// `[N]` of the quaternions as given (before normalisation).
+    /// `[N]` of the quaternions as given (before normalization).
     pub v_quats: Vec<[T; 4]>,
     /// `[N]` of the scales as given (logs if raw).
     pub v_scales: Vec<[T; 3]>,
     /// `[N]` of the opacities as given (logits if raw).
     pub v_opacities: Vec<T>,
-    /// Laid out as the colours were given: `[N * stride]` or `[N]`.
+    /// Laid out as the colors were given: `[N * stride]` or `[N]`.
     pub v_colors: Vec<[T; 3]>,
     /// Rows of the gradient of the viewmat's upper 3x4 block.
     pub v_viewmat: [[f64; 4]; 3],
@@ -293,16 +281,16 @@ pub struct SplatGradients<T> {
 /// Loss of a picture against a photo.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Loss<T> {
-    /// The loss; 0 where the photo is masked out everywhere.
+    /// The loss; 0 if the photo is masked out everywhere.
     pub value: T,
-    /// `[H * W]` its gradient with respect to the picture's colours.
+    /// `[H * W]` its gradient with respect to the picture's colors.
     pub v_color: Vec<[T; 3]>,
 }
 
 /// Adam's step sizes per kind of parameter.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Rates {
-    /// Centres, world units.
+    /// Centers, world units.
     pub means: f32,
     /// Quaternions.
     pub quats: f32,
@@ -312,7 +300,7 @@ pub struct Rates {
     pub opacities: f32,
     /// SH coefficient 0.
     pub sh0: f32,
-    /// The other SH coefficients.
+    /// Higher SH coefficients.
     pub sh_rest: f32,
 }
 
@@ -322,7 +310,7 @@ impl Rates {
         Self { means: 0.0, quats: 0.0, scales: 0.0, opacities: 0.0, sh0: 0.0, sh_rest: 0.0 };
 }
 
-/// What one step of the optimiser is to do.
+/// Settings of one optimizer step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AdamStep {
     /// Number of the step, from 1, for the bias correction.
@@ -335,7 +323,7 @@ pub struct AdamStep {
     pub opacity_regularizer: f32,
     /// Added to the loss: this times the mean scale (over splats and axes, world units).
     pub scale_regularizer: f32,
-    /// Size of the exploration noise on the centres (3DGS-MCMC, eq. 8), 0 for none. After Adam's
+    /// Size of the exploration noise on the centers (3DGS-MCMC, eq. 8), 0 for none. After Adam's
     /// update: mean += C (z * noise / (1 + exp(-100 (0.005 - opacity)))) with C the splat's 3D
     /// covariance, z from [`crate::fit::noise_normal`] and the parameters as updated.
     pub noise: f32,
@@ -344,23 +332,19 @@ pub struct AdamStep {
 }
 
 impl AdamStep {
-    /// Whether nothing moves: all rates are 0. The moments then stay as they are, too, and there is
-    /// no noise.
+    /// Whether all rates are 0: then no parameter, no moment, and no noise changes.
     pub fn is_frozen(&self) -> bool {
         self.rates == Rates::ZERO
     }
 
-    /// What Adam's moments of this step are multiplied by, since they began at 0 (Kingma and Ba,
-    /// 2015, algorithm 1): 1 / (1 - beta^number), for the first and the second.
+    /// Bias corrections of Adam's first and second moments at this step (Kingma and Ba, 2015, algorithm
+    /// 1): 1 / (1 - beta^number).
     pub fn bias(&self) -> [f64; 2] {
         let number = self.number.min(i32::MAX as u32) as i32;
         [ADAM.0, ADAM.1].map(|beta| 1.0 / (1.0 - f64::from(beta).powi(number)))
     }
 
     /// Checks every setting.
-    ///
-    /// # Errors
-    /// [`Error::Argument`] that names the setting.
     pub fn validate(&self) -> Result<()> {
         if self.number == 0 {
             return Err(Error::argument("step", "must be at least 1: the bias correction divides"));
@@ -382,7 +366,7 @@ impl AdamStep {
     }
 }
 
-/// Splats under optimisation: parameters and Adam's two moments, which have the same layout.
+/// Splats under optimization: parameters and Adam's two moments, which have the same layout.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct AdamState<T> {
     /// Parameters.
@@ -395,9 +379,6 @@ pub struct AdamState<T> {
 
 impl<T> AdamState<T> {
     /// Checks that parameters, moments and `gradients` belong to the same splats.
-    ///
-    /// # Errors
-    /// [`Error::Argument`] that names the array.
     pub fn validate(&self, gradients: &SplatGradients<T>) -> Result<()> {
         let (n, degree) = (self.splats.len(), self.splats.sh_degree);
         for (name, arrays) in
@@ -414,91 +395,11 @@ impl<T> AdamState<T> {
             ("v_scales", gradients.v_scales.len()),
             ("v_opacities", gradients.v_opacities.len()),
         ];
-        check_lengths(&lengths, n, "rows where means has")?;
+        check_lengths(&lengths, n, "rows, but means has")?;
         check_lengths(
             &[("v_colors", gradients.v_colors.len())],
             self.splats.sh.len(),
-            "rows where sh has",
+            "rows, but sh has",
         )
     }
-}
-
-/// The stages, as every implementation offers them. `bin` runs inside the two rasterize stages.
-pub trait Stages<T> {
-    /// Splats and camera to 2D splats.
-    fn project(
-        &self,
-        splats: &SplatParams<'_, T>,
-        camera: &Camera,
-        options: &ProjectOptions,
-    ) -> Result<Projected<T>>;
-
-    /// 2D splats to a picture over `background`.
-    fn rasterize(&self, projected: &Projected<T>, background: [T; 3]) -> Result<Image<T>>;
-
-    /// Gradients of the picture to gradients of the 2D splats. `image` is what
-    /// [`Stages::rasterize`] returned for the same arguments. `absolute` asks for
-    /// [`ProjectedGradients::v_means2d_absolute`].
-    fn rasterize_backward(
-        &self,
-        projected: &Projected<T>,
-        background: [T; 3],
-        image: &Image<T>,
-        v_image: &ImageGradients<T>,
-        absolute: bool,
-    ) -> Result<ProjectedGradients<T>>;
-
-    /// Gradients of the 2D splats to gradients of the splats and the camera.
-    fn project_backward(
-        &self,
-        splats: &SplatParams<'_, T>,
-        camera: &Camera,
-        options: &ProjectOptions,
-        projected: &Projected<T>,
-        v_projected: &ProjectedGradients<T>,
-    ) -> Result<SplatGradients<T>>;
-
-    /// A picture's colours as a photo of some gain and offset has them, `[H * W]`; see [`Exposure`].
-    /// Of the image, colour and transmittance are read.
-    fn exposure(&self, image: &Image<T>, exposure: &Exposure<T>) -> Result<Vec<[T; 3]>>;
-
-    /// Gradients of the corrected colours, `[H * W]`, to those of the picture and of gain and offset.
-    /// The arguments are those of [`Stages::exposure`].
-    fn exposure_backward(
-        &self,
-        image: &Image<T>,
-        exposure: &Exposure<T>,
-        v_corrected: &[[T; 3]],
-    ) -> Result<ExposureGradients<T>>;
-
-    /// Loss of a picture against a photo over `background`, with its gradient:
-    /// `sum_p w_p ((1 - s) mean_c |x - y| + s (1 - mean_c SSIM)) / count` over pixels p of weight w
-    /// and channels c, with s the `ssim_weight` in 0..=1, `count` the pixels whose weight is not 0,
-    /// and zeros around the picture in SSIM's window (Wang et al. 2004; 3DGS, eq. 7).
-    fn loss(
-        &self,
-        image: &Image<T>,
-        target: &Target,
-        background: [T; 3],
-        ssim_weight: f32,
-    ) -> Result<Loss<T>>;
-
-    /// Loss of a picture's depth against a photo's, with its gradients:
-    /// `sum_p c_p 2 |D_p - A_p z_p| / (D_p + A_p z_p) / count` over pixels p with A the picture's
-    /// alpha, D its accumulated depth, z the photo's depth, c its confidence, and `count` the pixels
-    /// whose confidence is not 0. Where the two nearly agree, a pixel's term is their relative
-    /// difference; it is at most 2, so that single wrong depths have little say. Pixels with A less
-    /// than [`DEPTH_ALPHA`](crate::constants::DEPTH_ALPHA) do not count. Of the image, alpha, depth
-    /// and transmittance are read.
-    fn depth_loss(&self, image: &Image<T>, target: &TargetDepth) -> Result<DepthLoss<T>>;
-
-    /// One optimiser step of all parameters (Kingma and Ba, 2015, algorithm 1), with the pull of the
-    /// regularisers and, after it, the exploration noise. `gradients` are those of
-    /// [`Stages::project_backward`]; its camera's are not read.
-    fn adam(
-        &self,
-        state: &mut AdamState<T>,
-        gradients: &SplatGradients<T>,
-        step: &AdamStep,
-    ) -> Result<()>;
 }

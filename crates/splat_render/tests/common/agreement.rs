@@ -1,35 +1,46 @@
-//! Where implementations once differed: splats behind the camera, 2D splats that no stage made, and
-//! options that make no sense.
+//! Regression checks: splats behind the camera, invalid 2D splats, and invalid options.
 
 use splat_render::constants::{BLUR, FAR, NEAR};
-use splat_render::fit::{DensityStats, FitDevice, FitState, Rates, StepInput, Target};
+use splat_render::fit::{FitDevice, FitState, Rates, StepInput, Target};
 use splat_render::stages::{AdamStep, ImageGradients, Projected};
 use splat_render::{Error, ProjectOptions, Stages};
 
-use super::optimisation::{full_step, random_adam, random_picture, random_target};
+use super::optimization::{full_step, random_adam, random_picture, random_target};
 use super::*;
 
-/// A 2D splat at or behind the camera's plane is not drawn and has no gradient.
-pub fn depths_that_are_not_positive_are_not_drawn(stages: &dyn Stages<f32>) {
+/// A 2D splat at or behind the camera's plane, or with values that are not finite, is not drawn and has
+/// no gradient.
+pub fn invalid_2d_splats_are_not_drawn(stages: &dyn Stages<f32>) {
     let good = random_projected(&mut rng(90), 30, 40, 30, 4.0);
     let mut without = good.clone();
     without.radii[7] = [0.0; 2];
     let expected = stages.rasterize(&without, [0.1; 3]).unwrap();
-    for depth in [0.0, -0.0, -1.0, -1e30, f32::NAN] {
-        let mut behind = good.clone();
-        behind.depths[7] = depth;
-        let image = stages.rasterize(&behind, [0.1; 3]).unwrap();
-        assert!(image == expected, "a splat at depth {depth} is drawn");
-        let v_image = random_image_gradients(&mut rng(91), image.alpha.len());
-        let v = stages.rasterize_backward(&behind, [0.1; 3], &image, &v_image, true).unwrap();
-        let none = v.v_means2d[7] == [0.0; 2]
-            && v.v_colors[7] == [0.0; 3]
-            && (v.v_opacities[7], v.v_depths[7]) == (0.0, 0.0);
-        assert!(none, "a splat at depth {depth} has a gradient");
+    let not_finite = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY];
+    type Spoil = fn(&mut Projected<f32>, f32);
+    let cases: [(&str, Spoil, &[f32]); 5] = [
+        ("depth", |p, v| p.depths[7] = v, &[0.0, -0.0, -1.0, -1e30, f32::NAN]),
+        ("mean", |p, v| p.means2d[7][0] = v, &not_finite),
+        ("factor", |p, v| p.factors[7][1] = v, &not_finite),
+        ("radius", |p, v| p.radii[7][1] = v, &not_finite),
+        ("opacity", |p, v| p.opacities[7] = v, &not_finite),
+    ];
+    for (name, spoil, values) in cases {
+        for &value in values {
+            let mut bad = good.clone();
+            spoil(&mut bad, value);
+            let image = stages.rasterize(&bad, [0.1; 3]).unwrap();
+            assert!(image == expected, "a splat with {name} {value} is drawn");
+            let v_image = random_image_gradients(&mut rng(91), image.alpha.len());
+            let v = stages.rasterize_backward(&bad, [0.1; 3], &image, &v_image, true).unwrap();
+            let none = v.v_means2d[7] == [0.0; 2]
+                && v.v_colors[7] == [0.0; 3]
+                && (v.v_opacities[7], v.v_depths[7]) == (0.0, 0.0);
+            assert!(none, "a splat with {name} {value} has a gradient");
+        }
     }
 }
 
-/// A near plane of 0 draws what lies before the camera, and only that.
+/// A near plane of 0 draws splats in front of the camera, and no others.
 pub fn a_near_plane_of_zero_draws_what_is_before_the_camera(stages: &dyn Stages<f32>) {
     let mut rng = rng(92);
     let mut scene = random_scene(&mut rng, 6, Some(1));
@@ -54,7 +65,7 @@ fn named<T>(result: splat_render::Result<T>) -> String {
 }
 
 /// Settings and sizes that make no sense are refused by every stage that takes them.
-pub fn senseless_options_are_refused(stages: &dyn Stages<f32>) {
+pub fn invalid_options_are_refused(stages: &dyn Stages<f32>) {
     let mut rng = rng(93);
     let scene = random_scene(&mut rng, 5, Some(1));
     let camera = random_camera(&mut rng, 20, 10);
@@ -73,9 +84,21 @@ pub fn senseless_options_are_refused(stages: &dyn Stages<f32>) {
         let backward = stages.project_backward(&scene.params(), &camera, &options, &projected, &v);
         assert_eq!(named(backward), name, "{options:?}");
     }
-    let no_size = Projected { width: 0, ..projected.clone() };
-    let backward = stages.project_backward(&scene.params(), &camera, &good, &no_size, &v);
-    assert_eq!(named(backward), "width, height");
+    type Spoil = fn(&mut Projected<f32>);
+    let spoiled: [(&str, Spoil); 5] = [
+        ("width, height", |p| p.width = 0),
+        ("width, height", |p| (p.width, p.height) = (1 << 30, 1 << 30)),
+        ("factors", |p| p.factors.truncate(4)),
+        ("depths", |p| p.depths.clear()),
+        ("radii", |p| p.radii.push([1.0; 2])),
+    ];
+    for (name, spoil) in spoiled {
+        let mut bad = projected.clone();
+        spoil(&mut bad);
+        assert_eq!(named(stages.rasterize(&bad, [0.0; 3])), name);
+        let backward = stages.project_backward(&scene.params(), &camera, &good, &bad, &v);
+        assert_eq!(named(backward), name);
+    }
 
     // The same number of pixels, otherwise laid out.
     let mut image = stages.rasterize(&projected, [0.0; 3]).unwrap();
@@ -119,38 +142,28 @@ fn fitted(device: &mut dyn FitDevice) -> (FitState, StepInput) {
     let mut rng = rng(94);
     let (state, _) = random_adam(&mut rng, 130, 2);
     let camera = random_camera(&mut rng, 40, 30);
-    let stats = DensityStats::zeros(130);
-    let state = FitState {
-        splats: state.splats,
-        first: state.first,
-        second: state.second,
-        stats,
-        frozen: 0,
-    };
+    let (first, second) = (state.first, state.second);
+    let state = FitState { first, second, ..FitState::new(state.splats) };
     device.set_targets(vec![random_target(&mut rng, 40, 30, false, false)]).unwrap();
     device.upload(state.clone()).unwrap();
     let input = StepInput {
-        view: 0,
-        camera,
         background: [0.2; 3],
         sh_degree: 1,
         rates: full_step(1).rates,
         step: 3,
-        ssim_weight: 0.2,
         opacity_regularizer: 0.01,
         scale_regularizer: 0.01,
         noise: 1.0,
         dropout: 0.1,
         noise_seed: 9,
         camera_gradient: true,
-        exposure: None,
-        depth_weight: 0.0,
+        ..StepInput::new(0, camera)
     };
     (state, input)
 }
 
-/// With all rates 0 a step moves no parameter and no moment; its loss, its statistics and its camera's
-/// gradient are those of a step that moves. Coefficients that are not in use rest in any step.
+/// With all rates 0, a step changes no parameter and no moment; loss, statistics and the camera's
+/// gradient are unaffected. Unused coefficients do not change in any step.
 pub fn frozen_steps_keep_the_moments(device: &mut dyn FitDevice) {
     let (before, input) = fitted(device);
     device.step(&StepInput { rates: Rates::ZERO, ..input }).unwrap();
@@ -174,11 +187,10 @@ pub fn frozen_steps_keep_the_moments(device: &mut dyn FitDevice) {
     }
 }
 
-/// The last splats of a state are drawn and never changed; the others take the step that they take
-/// where all move, and so do loss and camera.
+/// The last splats of a state are drawn and never changed; the rest, loss and camera are unaffected.
 pub fn the_last_splats_stay(device: &mut dyn FitDevice) {
     let (before, input) = fitted(device);
-    // The regularisers are means over the splats that move.
+    // The regularizers are means over the splats that move.
     let input = StepInput { opacity_regularizer: 0.0, scale_regularizer: 0.0, ..input };
     device.step(&input).unwrap();
     let all = device.download().unwrap();
@@ -208,7 +220,7 @@ pub fn the_last_splats_stay(device: &mut dyn FitDevice) {
 }
 
 /// Steps that make no sense are refused by every device, and change nothing.
-pub fn senseless_steps_are_refused(device: &mut dyn FitDevice) {
+pub fn invalid_steps_are_refused(device: &mut dyn FitDevice) {
     let (before, input) = fitted(device);
     let turned = Camera { width: 30, height: 40, ..input.camera };
     let nowhere = Camera { fx: f64::NAN, ..input.camera };

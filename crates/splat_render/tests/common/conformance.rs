@@ -1,5 +1,5 @@
-//! What every f32 implementation must show against the f64 reference, stage by stage and end to
-//! end. Each check prints its figures.
+//! Conformance of an f32 implementation with the f64 reference, stage by stage and end to end. Each check
+//! prints its figures.
 
 use rand_pcg::Pcg64;
 use splat_render::constants::{BLUR, FAR, NEAR};
@@ -31,10 +31,64 @@ const END_TO_END: (f64, f64) = (1e-4, 1e-6);
 const BAND: (f64, f64) = (1e-4, 2e-2);
 
 /// Pictures whose sides are and are not multiples of a tile, down to one pixel.
-pub const SIZES: [(u32, u32); 5] = [(64, 64), (1, 1), (17, 33), (100, 31), (130, 7)];
+const SIZES: [(u32, u32); 9] =
+    [(64, 64), (1, 1), (17, 33), (100, 31), (130, 7), (16, 16), (100, 75), (1, 130), (300, 5)];
+/// SH degrees, or direct colors.
+const DEGREES: [Option<u32>; 6] = [None, Some(0), Some(1), Some(2), Some(3), Some(4)];
 
-/// Pixels of `band` where the pictures differ by more than `bound`: only these are left out, and at
-/// most 0.1 % of all (or one, in pictures of under 1 000 pixels).
+/// The project stages, for every degree, with raw and activated parameters.
+pub fn projecting_matches_the_reference(stages: &dyn Stages<f32>, bounds: Bounds) {
+    for (k, degree) in DEGREES.into_iter().enumerate() {
+        for n in [1, 150, 2500] {
+            let seed = (k * 10 + n) as u64;
+            let mut rng = rng(seed);
+            let (width, height) = SIZES[(k + n) % SIZES.len()];
+            let camera = random_camera(&mut rng, width, height);
+            let mut scene = random_scene(&mut rng, n, degree);
+            if n == 150 {
+                scene.raw = false;
+                scene.scales.as_flattened_mut().iter_mut().for_each(|s| *s = s.exp());
+                scene.opacities.iter_mut().for_each(|o| *o = 1.0 / (1.0 + (-*o).exp()));
+            }
+            for options in OPTIONS {
+                let aa = options.antialiased;
+                let what = format!("{n} splats, SH {degree:?}, antialiased {aa}");
+                project_stages(stages, &scene, &camera, &options, seed, bounds, &what);
+            }
+        }
+    }
+}
+
+/// The rasterize stages, for every size of pictures and splats.
+pub fn rasterizing_matches_the_reference(stages: &dyn Stages<f32>, bounds: Bounds) {
+    for (k, (width, height)) in SIZES.into_iter().enumerate() {
+        for (n, sigma) in [(0, 3.0), (1, 8.0), (7, 1.0), (60, 30.0), (300, 3.0)] {
+            let seed = (k * 10 + n) as u64;
+            let projected = random_projected(&mut rng(seed), n, width, height, sigma);
+            let what = format!("{width}x{height}, {n} splats of {sigma} px");
+            rasterize_stages(stages, &projected, seed, bounds, &what);
+        }
+    }
+}
+
+/// All four stages in turn.
+pub fn rendering_matches_the_reference(stages: &dyn Stages<f32>, bounds: Bounds) {
+    for (k, (width, height)) in SIZES.into_iter().enumerate() {
+        for (n, degree) in [(1, None), (10, Some(3)), (200, Some(3)), (2000, Some(1))] {
+            let mut rng = rng((k * 7 + n) as u64);
+            let camera = random_camera(&mut rng, width, height);
+            let scene = random_scene(&mut rng, n, degree);
+            for options in OPTIONS {
+                let aa = options.antialiased;
+                let what = format!("{width}x{height}, {n} splats, SH {degree:?}, antialiased {aa}");
+                end_to_end(stages, &scene, &camera, &options, &mut rng, bounds, &what);
+            }
+        }
+    }
+}
+
+/// Pixels of `band` at which the pictures differ by more than `bound`: at most 0.1 % (or one, for under 1
+/// 000 pixels).
 fn left_out(got: &Image<f32>, expected: &Image<f64>, band: &[bool], bound: f64) -> Vec<bool> {
     // Depth counts as in image_difference: as a part of the largest.
     let depth_scale = expected.depth.iter().fold(1.0f64, |scale, d| scale.max(d.abs()));
@@ -50,7 +104,7 @@ fn left_out(got: &Image<f32>, expected: &Image<f64>, band: &[bool], bound: f64) 
     out
 }
 
-/// The gradients with zeros where the pictures may rightly differ.
+/// The gradients with zeros at pixels that may differ.
 fn masked(v_image: &ImageGradients<f32>, left_out: &[bool]) -> ImageGradients<f32> {
     let mut out = v_image.clone();
     for (pixel, &out_of_it) in left_out.iter().enumerate() {
@@ -104,15 +158,11 @@ pub fn rasterize_stages(
             true,
         )
         .unwrap();
-    let differences = projected_gradient_differences(&v, &expected);
-    for (name, d) in &differences {
-        println!("{what}: {name} {:.1e} of the largest", d.relative());
-    }
-    assert_gradients(&differences, bounds.gradient, what);
+    assert_gradients(&projected_gradient_differences(&v, &expected), bounds.gradient, what);
 }
 
 /// project and project_backward on identical splats.
-pub fn project_stages(
+fn project_stages(
     stages: &dyn Stages<f32>,
     scene: &Scene<f32>,
     camera: &Camera,
@@ -126,7 +176,7 @@ pub fn project_stages(
     let got = stages.project(&scene.params(), camera, options).unwrap();
     let wide_scene = scene.widen();
     let expected = Reference.project(&wide_scene.params(), camera, options).unwrap();
-    let v = random_projected_gradients(&mut rng, &narrow_projected(&expected));
+    let v = random_projected_gradients(&mut rng, &convert_projected(&expected, narrowed));
     let run = || stages.project_backward(&scene.params(), camera, options, &got, &v).unwrap();
     let gradients = run();
     assert!(
@@ -143,11 +193,18 @@ pub fn project_stages(
         )
         .unwrap();
     assert_same_culled(&got, &expected, what);
-    let differences = splat_gradient_differences(&gradients, &expected_gradients);
-    for (name, d) in &differences {
-        println!("{what}: {name} {:.1e} of the largest", d.relative());
+    for (name, off, bound) in [
+        ("means2d", difference(&got.means2d, &expected.means2d, &[]), 2e-6),
+        ("factors", difference(&got.factors, &expected.factors, &[]), 1e-5),
+        ("depths", difference1(&got.depths, &expected.depths, &[]), 1e-6),
+        ("colors", difference(&got.colors, &expected.colors, &[]), 2e-6),
+        ("opacities", difference1(&got.opacities, &expected.opacities, &[]), 1e-6),
+        ("radii", difference(&got.radii, &expected.radii, &[]), 1e-4),
+    ] {
+        assert!(off.relative() <= bound, "{what}: {name} {off:?}");
     }
-    assert_gradients(&differences, bounds.gradient, what);
+    let off = splat_gradient_differences(&gradients, &expected_gradients);
+    assert_gradients(&off, bounds.gradient, what);
 }
 
 fn assert_same_culled(got: &Projected<f32>, expected: &Projected<f64>, what: &str) {
@@ -158,7 +215,7 @@ fn assert_same_culled(got: &Projected<f32>, expected: &Projected<f64>, what: &st
 }
 
 /// The camera with values that f32 holds exactly, so that all implementations get the same.
-pub fn rounded(camera: &Camera) -> Camera {
+fn rounded(camera: &Camera) -> Camera {
     let f = |v: f64| f64::from(v as f32);
     Camera {
         viewmat: glam::DMat4::from_cols_array(&camera.viewmat.to_cols_array().map(f)),
@@ -221,9 +278,6 @@ pub fn end_to_end(
     let expected_gradients = Reference
         .project_backward(&wide_scene.params(), camera, options, &expected_projected, &expected_v)
         .unwrap();
-    let differences = splat_gradient_differences(&gradients, &expected_gradients);
-    for (name, d) in &differences {
-        println!("{what}: {name} {:.1e} of the largest", d.relative());
-    }
-    assert_gradients(&differences, bounds.gradient, what);
+    let off = splat_gradient_differences(&gradients, &expected_gradients);
+    assert_gradients(&off, bounds.gradient, what);
 }

@@ -1,27 +1,46 @@
 //! Seeded random scenes, f32/f64 conversions and comparators, shared by the tests of all backends.
 #![allow(dead_code)] // Each test binary uses its own part.
 
+/// Declares a test of each check, run on each of `$stages`.
+#[allow(unused_macros)]
+macro_rules! checks {
+    ($stages:expr; $($module:ident::$check:ident($($argument:expr),*);)*) => {
+        $(#[test]
+        fn $check() {
+            for stages in $stages {
+                common::$module::$check(stages, $($argument),*);
+            }
+        })*
+    };
+}
+
 pub mod agreement;
 pub mod conformance;
+mod convert;
 pub mod hard_cases;
 pub mod narrowed;
-pub mod optimisation;
+pub mod optimization;
 pub mod properties;
 pub mod waiting;
 
+pub use convert::*;
 use glam::{DMat3, DMat4, DQuat, DVec3};
 use rand::{Rng, SeedableRng};
 use rand_pcg::Pcg64;
 use splat_render::constants::BLUR;
+use splat_render::fit::Rates;
 use splat_render::splats::SplatArrays;
-use splat_render::stages::{
-    AdamState, Colors, Exposure, Image, ImageGradients, Projected, ProjectedGradients,
-};
-use splat_render::{Camera, SplatGradients, SplatParams};
+use splat_render::stages::{Colors, Float, Image, ImageGradients, Projected, ProjectedGradients};
+use splat_render::{Camera, ProjectOptions, SplatGradients, SplatParams, Stages};
 
 /// A seeded generator.
 pub fn rng(seed: u64) -> Pcg64 {
     Pcg64::seed_from_u64(seed)
+}
+
+/// Runs work on a number of threads.
+pub fn on_threads<T: Send>(threads: usize, work: impl FnOnce() -> T + Send) -> T {
+    rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap().install(work)
 }
 
 /// A standard normal draw (Box-Muller).
@@ -37,7 +56,7 @@ pub struct Scene<T> {
     pub quats: Vec<[T; 4]>,
     pub scales: Vec<[T; 3]>,
     pub opacities: Vec<T>,
-    /// `[N * sh_stride]`, or `[N]` where `sh_stride` is 0 (direct colours).
+    /// `[N * sh_stride]`, or `[N]` direct colors if `sh_stride` is 0.
     pub colors: Vec<[T; 3]>,
     pub sh_degree: u32,
     pub sh_stride: usize,
@@ -61,137 +80,77 @@ impl<T> Scene<T> {
     }
 }
 
+/// Rates of a fit's steps.
+pub const RATES: Rates =
+    Rates { means: 1e-3, quats: 1e-3, scales: 5e-3, opacities: 5e-2, sh0: 5e-3, sh_rest: 2.5e-4 };
+
 impl Scene<f32> {
-    pub fn widen(&self) -> Scene<f64> {
-        Scene {
-            means: widen(&self.means),
-            quats: widen(&self.quats),
-            scales: widen(&self.scales),
-            opacities: widen1(&self.opacities),
-            colors: widen(&self.colors),
+    /// The splats of a fit.
+    pub fn arrays(self) -> SplatArrays {
+        SplatArrays {
+            means: self.means,
+            quats: self.quats,
+            scales: self.scales,
+            opacities: self.opacities,
+            sh: self.colors,
             sh_degree: self.sh_degree,
-            sh_stride: self.sh_stride,
-            raw: self.raw,
         }
     }
-}
 
-pub fn widen<const K: usize>(rows: &[[f32; K]]) -> Vec<[f64; K]> {
-    rows.iter().map(|row| row.map(f64::from)).collect()
-}
-
-pub fn widen1(values: &[f32]) -> Vec<f64> {
-    values.iter().map(|&v| f64::from(v)).collect()
-}
-
-/// What f32 holds of a value; its largest where it holds it not.
-fn narrow_one(value: f64) -> f32 {
-    (value as f32).clamp(f32::MIN, f32::MAX)
-}
-
-pub fn narrow<const K: usize>(rows: &[[f64; K]]) -> Vec<[f32; K]> {
-    rows.iter().map(|row| row.map(narrow_one)).collect()
-}
-
-pub fn narrow1(values: &[f64]) -> Vec<f32> {
-    values.iter().map(|&v| narrow_one(v)).collect()
-}
-
-pub fn widen_projected(p: &Projected<f32>) -> Projected<f64> {
-    Projected {
-        width: p.width,
-        height: p.height,
-        means2d: widen(&p.means2d),
-        factors: widen(&p.factors),
-        depths: widen1(&p.depths),
-        colors: widen(&p.colors),
-        opacities: widen1(&p.opacities),
-        radii: widen(&p.radii),
+    pub fn widen(&self) -> Scene<f64> {
+        narrowed::widened(&self.params())
     }
 }
 
-pub fn narrow_projected(p: &Projected<f64>) -> Projected<f32> {
-    Projected {
-        width: p.width,
-        height: p.height,
-        means2d: narrow(&p.means2d),
-        factors: narrow(&p.factors),
-        depths: narrow1(&p.depths),
-        colors: narrow(&p.colors),
-        opacities: narrow1(&p.opacities),
-        radii: narrow(&p.radii),
-    }
+/// The picture of splats.
+pub fn render<T: Float>(
+    stages: &dyn Stages<T>,
+    splats: &SplatParams<'_, T>,
+    camera: &Camera,
+    background: [T; 3],
+) -> Image<T> {
+    let projected = stages.project(splats, camera, &ProjectOptions::default()).unwrap();
+    stages.rasterize(&projected, background).unwrap()
 }
 
-pub fn widen_image(i: &Image<f32>) -> Image<f64> {
-    Image {
-        width: i.width,
-        height: i.height,
-        color: widen(&i.color),
-        alpha: widen1(&i.alpha),
-        depth: widen1(&i.depth),
-        transmittance: widen1(&i.transmittance),
-    }
+/// Results of the four stages.
+#[derive(PartialEq)]
+pub struct Pass {
+    pub projected: Projected<f32>,
+    pub image: Image<f32>,
+    pub v_projected: ProjectedGradients<f32>,
+    pub v_splats: SplatGradients<f32>,
 }
 
-pub fn widen_exposure(e: &Exposure<f32>) -> Exposure<f64> {
-    Exposure {
-        gain: e.gain.map(f64::from),
-        offset: e.offset.map(f64::from),
-        background: e.background.map(|color| color.map(f64::from)),
-    }
-}
-
-pub fn widen_image_gradients(g: &ImageGradients<f32>) -> ImageGradients<f64> {
-    ImageGradients {
-        v_color: widen(&g.v_color),
-        v_alpha: widen1(&g.v_alpha),
-        v_depth: widen1(&g.v_depth),
-    }
-}
-
-pub fn widen_projected_gradients(g: &ProjectedGradients<f32>) -> ProjectedGradients<f64> {
-    ProjectedGradients {
-        v_means2d: widen(&g.v_means2d),
-        v_factors: widen(&g.v_factors),
-        v_depths: widen1(&g.v_depths),
-        v_colors: widen(&g.v_colors),
-        v_opacities: widen1(&g.v_opacities),
-        v_background: g.v_background.map(f64::from),
-        v_means2d_absolute: g.v_means2d_absolute.as_deref().map(widen),
-    }
-}
-
-pub fn widen_splat_gradients(g: &SplatGradients<f32>) -> SplatGradients<f64> {
-    SplatGradients {
-        v_means: widen(&g.v_means),
-        v_quats: widen(&g.v_quats),
-        v_scales: widen(&g.v_scales),
-        v_opacities: widen1(&g.v_opacities),
-        v_colors: widen(&g.v_colors),
-        v_viewmat: g.v_viewmat,
-        v_intrinsics: g.v_intrinsics,
-    }
-}
-
-pub fn widen_adam_state(state: &AdamState<f32>) -> AdamState<f64> {
-    let wide = |arrays: &SplatArrays| SplatArrays {
-        means: widen(&arrays.means),
-        quats: widen(&arrays.quats),
-        scales: widen(&arrays.scales),
-        opacities: widen1(&arrays.opacities),
-        sh: widen(&arrays.sh),
-        sh_degree: arrays.sh_degree,
+/// Runs the four stages; the picture's gradients are those of a loss, or random from a seed.
+pub fn pass(
+    stages: &dyn Stages<f32>,
+    scene: &Scene<f32>,
+    camera: &Camera,
+    options: &ProjectOptions,
+    seed: Option<u64>,
+) -> Pass {
+    let background = [0.3, 0.2, 0.1];
+    let projected = stages.project(&scene.params(), camera, options).unwrap();
+    let image = stages.rasterize(&projected, background).unwrap();
+    let v_image = match seed {
+        Some(seed) => random_image_gradients(&mut rng(seed), image.alpha.len()),
+        None => ImageGradients {
+            v_color: image.color.iter().map(|c| c.map(|v| v - 0.5)).collect(),
+            v_alpha: image.alpha.clone(),
+            v_depth: image.depth.clone(),
+        },
     };
-    AdamState {
-        splats: wide(&state.splats),
-        first: wide(&state.first),
-        second: wide(&state.second),
-    }
+    let v_projected =
+        stages.rasterize_backward(&projected, background, &image, &v_image, true).unwrap();
+    let v_splats = stages
+        .project_backward(&scene.params(), camera, options, &projected, &v_projected)
+        .unwrap();
+    Pass { projected, image, v_projected, v_splats }
 }
 
 /// A camera 4 units from the world's origin, looking at it from a random side, with its principal
-/// point off the centre.
+/// point off the center.
 pub fn random_camera(rng: &mut Pcg64, width: u32, height: u32) -> Camera {
     let axis = DVec3::new(normal(rng), normal(rng), normal(rng)).normalize();
     let rotation =
@@ -213,7 +172,7 @@ pub fn random_camera(rng: &mut Pcg64, width: u32, height: u32) -> Camera {
 }
 
 /// N splats around the world's origin, most of them in view of [`random_camera`]. `sh_degree`
-/// None gives direct colours. Parameters are raw (log-scales, opacity logits).
+/// None gives direct colors. Parameters are raw (log-scales, opacity logits).
 pub fn random_scene(rng: &mut Pcg64, n: usize, sh_degree: Option<u32>) -> Scene<f32> {
     let mut scene = Scene::<f32> { raw: true, ..Scene::default() };
     if let Some(degree) = sh_degree {
@@ -265,6 +224,30 @@ pub fn random_projected(
     out
 }
 
+/// All numbers of a 2D splat.
+pub fn splat_2d(
+    p: &Projected<f32>,
+    i: usize,
+) -> ([f32; 2], [f32; 3], f32, [f32; 3], f32, [f32; 2]) {
+    (p.means2d[i], p.factors[i], p.depths[i], p.colors[i], p.opacities[i], p.radii[i])
+}
+
+/// All gradients of a splat.
+type OfSplat<'a> = ([f32; 3], [f32; 4], [f32; 3], f32, &'a [[f32; 3]]);
+
+/// Gradients of a splat with `stride` rows of colors.
+pub fn splat_gradients(v: &SplatGradients<f32>, i: usize, stride: usize) -> OfSplat<'_> {
+    let colors = &v.v_colors[stride * i..stride * (i + 1)];
+    (v.v_means[i], v.v_quats[i], v.v_scales[i], v.v_opacities[i], colors)
+}
+
+/// Whether all gradients are finite.
+pub fn all_finite(v: &SplatGradients<f32>) -> bool {
+    v.v_means.iter().chain(&v.v_scales).chain(&v.v_colors).flatten().all(|v| v.is_finite())
+        && v.v_quats.iter().flatten().chain(&v.v_opacities).all(|v| v.is_finite())
+        && v.v_viewmat.iter().flatten().chain(&v.v_intrinsics).all(|v| v.is_finite())
+}
+
 /// Gives splat `i` a 2D Gaussian (standard deviations in px before the blur) and its extent.
 pub fn place(
     out: &mut Projected<f32>,
@@ -291,7 +274,7 @@ pub fn place(
     }
 }
 
-/// Random gradients of a picture: N(0, 1) colours, smaller alpha and depth parts.
+/// Random gradients of a picture: N(0, 1) colors, smaller alpha and depth parts.
 pub fn random_image_gradients(rng: &mut Pcg64, pixels: usize) -> ImageGradients<f32> {
     ImageGradients {
         v_color: (0..pixels).map(|_| std::array::from_fn(|_| normal(rng) as f32)).collect(),
@@ -300,7 +283,7 @@ pub fn random_image_gradients(rng: &mut Pcg64, pixels: usize) -> ImageGradients<
     }
 }
 
-/// Random gradients of N projected splats, zero where culled.
+/// Random gradients of N projected splats, zero for culled ones.
 pub fn random_projected_gradients(
     rng: &mut Pcg64,
     projected: &Projected<f32>,
@@ -324,7 +307,7 @@ pub fn random_projected_gradients(
 pub struct Difference {
     /// Largest absolute difference; NaN in either array makes it infinite.
     pub max: f64,
-    /// Mean absolute difference over what was compared.
+    /// Mean absolute difference.
     pub mean: f64,
     /// Largest magnitude in the expected array.
     pub scale: f64,
@@ -333,7 +316,7 @@ pub struct Difference {
 }
 
 impl Difference {
-    /// Largest difference as a part of the largest expected value (0 where both vanish).
+    /// Largest difference relative to the largest expected value (0 if both vanish).
     pub fn relative(&self) -> f64 {
         if self.max == 0.0 { 0.0 } else { self.max / self.scale }
     }
@@ -379,14 +362,10 @@ pub fn difference<const K: usize>(
 
 /// [`difference`] of scalars.
 pub fn difference1(got: &[f32], expected: &[f64], skip: &[bool]) -> Difference {
-    difference(bytemuck_rows(got), expected.as_chunks::<1>().0, skip)
+    difference(got.as_chunks::<1>().0, expected.as_chunks::<1>().0, skip)
 }
 
-fn bytemuck_rows(values: &[f32]) -> &[[f32; 1]] {
-    values.as_chunks::<1>().0
-}
-
-/// Difference of two pictures (colour, alpha, transmittance; depth as a part of the largest),
+/// Difference of two pictures (color, alpha, transmittance; depth as a part of the largest),
 /// pixels in `band` left out.
 pub fn image_difference(got: &Image<f32>, expected: &Image<f64>, band: &[bool]) -> Difference {
     assert_eq!((got.width, got.height), (expected.width, expected.height));
@@ -456,9 +435,10 @@ pub fn splat_gradient_differences(
     ]
 }
 
-/// Asserts each kind's largest difference to be at most `bound` of its largest value.
+/// Prints each kind's largest difference, and asserts it to be at most `bound` of its largest value.
 pub fn assert_gradients(differences: &[(&'static str, Difference)], bound: f64, what: &str) {
     for (name, difference) in differences {
+        println!("{what}: {name} {:.1e} of the largest", difference.relative());
         assert!(
             difference.relative() <= bound,
             "{what}: {name} is off by {:.2e} of its largest value {:.2e}, more than {bound:.0e}",

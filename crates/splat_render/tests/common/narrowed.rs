@@ -1,5 +1,4 @@
-//! The reference behind the f32 interface, so that what every implementation must get through is
-//! also asked of the oracle.
+//! The reference behind the f32 interface, so that it must pass the same checks.
 
 use splat_render::fit::{Target, TargetDepth};
 use splat_render::reference::Reference;
@@ -11,10 +10,10 @@ use splat_render::{
 
 use super::*;
 
-/// The reference on widened arguments; what leaves f32's range comes back as its largest value.
+/// The reference on widened arguments; results are clamped to f32's range.
 pub struct Narrowed;
 
-fn widened(splats: &SplatParams<'_, f32>) -> Scene<f64> {
+pub fn widened(splats: &SplatParams<'_, f32>) -> Scene<f64> {
     let (sh_degree, sh_stride, colors) = match splats.colors {
         Colors::Direct(colors) => (0, 0, colors),
         Colors::Sh { degree, stride, coeffs } => (degree, stride, coeffs),
@@ -32,28 +31,26 @@ fn widened(splats: &SplatParams<'_, f32>) -> Scene<f64> {
 }
 
 impl Stages<f32> for Narrowed {
-    fn project(
+    fn project_unchecked(
         &self,
         splats: &SplatParams<'_, f32>,
         camera: &Camera,
         options: &ProjectOptions,
     ) -> Result<Projected<f32>> {
-        Ok(narrow_projected(&Reference.project(&widened(splats).params(), camera, options)?))
+        let projected = Reference.project(&widened(splats).params(), camera, options)?;
+        Ok(convert_projected(&projected, narrowed))
     }
 
-    fn rasterize(&self, projected: &Projected<f32>, background: [f32; 3]) -> Result<Image<f32>> {
+    fn rasterize_unchecked(
+        &self,
+        projected: &Projected<f32>,
+        background: [f32; 3],
+    ) -> Result<Image<f32>> {
         let image = Reference.rasterize(&widen_projected(projected), background.map(f64::from))?;
-        Ok(Image {
-            width: image.width,
-            height: image.height,
-            color: narrow(&image.color),
-            alpha: narrow1(&image.alpha),
-            depth: narrow1(&image.depth),
-            transmittance: narrow1(&image.transmittance),
-        })
+        Ok(convert_image(&image, narrowed))
     }
 
-    fn rasterize_backward(
+    fn rasterize_backward_unchecked(
         &self,
         projected: &Projected<f32>,
         background: [f32; 3],
@@ -68,18 +65,10 @@ impl Stages<f32> for Narrowed {
             &widen_image_gradients(v_image),
             absolute,
         )?;
-        Ok(ProjectedGradients {
-            v_means2d: narrow(&v.v_means2d),
-            v_factors: narrow(&v.v_factors),
-            v_depths: narrow1(&v.v_depths),
-            v_colors: narrow(&v.v_colors),
-            v_opacities: narrow1(&v.v_opacities),
-            v_background: narrow(&[v.v_background])[0],
-            v_means2d_absolute: v.v_means2d_absolute.as_deref().map(narrow),
-        })
+        Ok(convert_projected_gradients(&v, narrowed))
     }
 
-    fn project_backward(
+    fn project_backward_unchecked(
         &self,
         splats: &SplatParams<'_, f32>,
         camera: &Camera,
@@ -94,22 +83,18 @@ impl Stages<f32> for Narrowed {
             &widen_projected(projected),
             &widen_projected_gradients(v_projected),
         )?;
-        Ok(SplatGradients {
-            v_means: narrow(&v.v_means),
-            v_quats: narrow(&v.v_quats),
-            v_scales: narrow(&v.v_scales),
-            v_opacities: narrow1(&v.v_opacities),
-            v_colors: narrow(&v.v_colors),
-            v_viewmat: v.v_viewmat,
-            v_intrinsics: v.v_intrinsics,
-        })
+        Ok(convert_splat_gradients(&v, narrowed))
     }
 
-    fn exposure(&self, image: &Image<f32>, exposure: &Exposure<f32>) -> Result<Vec<[f32; 3]>> {
+    fn exposure_unchecked(
+        &self,
+        image: &Image<f32>,
+        exposure: &Exposure<f32>,
+    ) -> Result<Vec<[f32; 3]>> {
         Ok(narrow(&Reference.exposure(&widen_image(image), &widen_exposure(exposure))?))
     }
 
-    fn exposure_backward(
+    fn exposure_backward_unchecked(
         &self,
         image: &Image<f32>,
         exposure: &Exposure<f32>,
@@ -125,16 +110,20 @@ impl Stages<f32> for Narrowed {
         })
     }
 
-    fn depth_loss(&self, image: &Image<f32>, target: &TargetDepth) -> Result<DepthLoss<f32>> {
+    fn depth_loss_unchecked(
+        &self,
+        image: &Image<f32>,
+        target: &TargetDepth,
+    ) -> Result<DepthLoss<f32>> {
         let loss = Reference.depth_loss(&widen_image(image), target)?;
         Ok(DepthLoss {
-            value: loss.value as f32,
+            value: narrowed(loss.value),
             v_alpha: narrow1(&loss.v_alpha),
             v_depth: narrow1(&loss.v_depth),
         })
     }
 
-    fn loss(
+    fn loss_unchecked(
         &self,
         image: &Image<f32>,
         target: &Target,
@@ -143,10 +132,10 @@ impl Stages<f32> for Narrowed {
     ) -> Result<Loss<f32>> {
         let background = background.map(f64::from);
         let loss = Reference.loss(&widen_image(image), target, background, ssim_weight)?;
-        Ok(Loss { value: narrow1(&[loss.value])[0], v_color: narrow(&loss.v_color) })
+        Ok(Loss { value: narrowed(loss.value), v_color: narrow(&loss.v_color) })
     }
 
-    fn adam(
+    fn adam_unchecked(
         &self,
         state: &mut AdamState<f32>,
         gradients: &SplatGradients<f32>,
@@ -154,19 +143,7 @@ impl Stages<f32> for Narrowed {
     ) -> Result<()> {
         let mut wide = widen_adam_state(state);
         Reference.adam(&mut wide, &widen_splat_gradients(gradients), step)?;
-        let narrowed = |arrays: &SplatArrays<f64>| SplatArrays {
-            means: narrow(&arrays.means),
-            quats: narrow(&arrays.quats),
-            scales: narrow(&arrays.scales),
-            opacities: narrow1(&arrays.opacities),
-            sh: narrow(&arrays.sh),
-            sh_degree: arrays.sh_degree,
-        };
-        *state = AdamState {
-            splats: narrowed(&wide.splats),
-            first: narrowed(&wide.first),
-            second: narrowed(&wide.second),
-        };
+        *state = convert_adam_state(&wide, narrowed);
         Ok(())
     }
 }

@@ -1,9 +1,9 @@
-//! What holds for every scene, on drawn ones.
+//! Properties of all scenes, tested on random ones.
 
 use proptest::prelude::{Strategy, any, prop, prop_assert, prop_assert_eq, prop_oneof};
 use proptest::test_runner::{Config, RngSeed, TestRunner};
 use rand::Rng;
-use splat_render::{Camera, ProjectOptions, SplatGradients, Stages};
+use splat_render::{Camera, ProjectOptions, Stages};
 
 use super::conformance::{Bounds, rasterize_stages};
 use super::*;
@@ -56,29 +56,16 @@ fn any_scene() -> impl Strategy<Value = Scene<f32>> {
     })
 }
 
-fn all_finite(v: &SplatGradients<f32>) -> bool {
-    v.v_means.iter().chain(&v.v_scales).chain(&v.v_colors).flatten().all(|v| v.is_finite())
-        && v.v_quats.iter().flatten().all(|v| v.is_finite())
-        && v.v_opacities.iter().all(|v| v.is_finite())
-        && v.v_viewmat.iter().flatten().all(|v| v.is_finite())
-        && v.v_intrinsics.iter().all(|v| v.is_finite())
-}
-
 /// Whatever the parameters are, picture and gradients are finite, and culled splats have none.
 pub fn any_values_give_finite_results(stages: &dyn Stages<f32>, cases: u32) {
     let inputs = (any_scene(), 1u32..40, 1u32..40, any::<bool>());
     let check = |(scene, width, height, antialiased): (Scene<f32>, u32, u32, bool)| {
         let camera = camera(width, height);
         let options = ProjectOptions { antialiased, ..ProjectOptions::default() };
-        let projected = stages.project(&scene.params(), &camera, &options).unwrap();
-        let image = stages.rasterize(&projected, [0.2, 0.4, 0.6]).unwrap();
+        let Pass { projected, image, v_splats: v, .. } =
+            pass(stages, &scene, &camera, &options, Some(5));
         prop_assert!(image.color.iter().flatten().chain(&image.depth).all(|v| v.is_finite()));
         prop_assert!(image.transmittance.iter().all(|t| (0.0..=1.0).contains(t)));
-        let v_image = random_image_gradients(&mut rng(5), image.alpha.len());
-        let v2d =
-            stages.rasterize_backward(&projected, [0.2, 0.4, 0.6], &image, &v_image, true).unwrap();
-        let v =
-            stages.project_backward(&scene.params(), &camera, &options, &projected, &v2d).unwrap();
         prop_assert!(all_finite(&v), "{v:?}");
         for i in 0..scene.means.len() {
             if projected.radii[i] == [0.0; 2] {
@@ -105,12 +92,9 @@ pub fn the_order_of_splats_does_not_matter(stages: &dyn Stages<f32>, cases: u32)
         }
         let mut shuffled = projected.clone();
         for (i, &k) in from.iter().enumerate() {
-            shuffled.means2d[i] = projected.means2d[k];
-            shuffled.factors[i] = projected.factors[k];
-            shuffled.depths[i] = projected.depths[k];
-            shuffled.colors[i] = projected.colors[k];
-            shuffled.opacities[i] = projected.opacities[k];
-            shuffled.radii[i] = projected.radii[k];
+            let s = &mut shuffled;
+            (s.means2d[i], s.factors[i], s.depths[i], s.colors[i], s.opacities[i], s.radii[i]) =
+                splat_2d(&projected, k);
         }
         let background = [0.1, 0.9, 0.4];
         let image = stages.rasterize(&projected, background).unwrap();
@@ -130,7 +114,7 @@ pub fn the_order_of_splats_does_not_matter(stages: &dyn Stages<f32>, cases: u32)
 }
 
 /// Pictures of any size, of splats of any size, within the bounds.
-pub fn drawn_pictures_match_the_reference(stages: &dyn Stages<f32>, bounds: Bounds, cases: u32) {
+pub fn random_pictures_match_the_reference(stages: &dyn Stages<f32>, bounds: Bounds, cases: u32) {
     let inputs = (0usize..200, 1u32..70, 1u32..70, any::<u64>(), 0.05f64..60.0);
     let check = |(n, width, height, seed, deviation): (usize, u32, u32, u64, f64)| {
         let projected = random_projected(&mut rng(seed), n, width, height, deviation);

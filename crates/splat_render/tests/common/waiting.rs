@@ -1,21 +1,19 @@
-//! Colours of splats that a step does not see take its update later; no bit may tell.
+//! Delayed color updates of unseen splats change no bit.
 
-use splat_render::fit::{
-    COLOR_WAIT, DensityStats, FitDevice, FitState, McmcRun, OriginalRun, Rates, StepInput,
-};
+use splat_render::fit::{COLOR_WAIT, FitDevice, FitState, McmcRun, OriginalRun, Rates, StepInput};
 
-use super::optimisation::{random_adam, random_target};
+use super::optimization::{random_adam, random_target};
 use super::*;
 
 const STEPS: u32 = 2 * COLOR_WAIT as u32 + 30;
 /// After these steps the degree grows, and in those nothing moves: both end all waiting, and between them
-/// it lasts longer than colours may wait.
+/// it lasts longer than colors may wait.
 const GROWS: [u32; 2] = [20, STEPS - 50];
 const FROZEN: [u32; 3] = [3, 200, STEPS - 20];
 const _: () = assert!(FROZEN[1] - GROWS[0] > COLOR_WAIT as u32 + 1);
 
-/// Cameras that see a part of the scene each, and a state amid a fit, so that what no camera sees drifts.
-/// Some moments are zero, some splats are only drawn.
+/// Cameras that see a part of the scene each, and a state in the middle of a fit, so that unseen splats
+/// drift. Some moments are zero, some splats are frozen.
 fn begin(device: &mut dyn FitDevice, seed: u64) -> (Vec<Camera>, FitState) {
     let mut rng = rng(seed);
     let (adam, _) = random_adam(&mut rng, 300, 3);
@@ -25,7 +23,6 @@ fn begin(device: &mut dyn FitDevice, seed: u64) -> (Vec<Camera>, FitState) {
         state.first.clear(i);
         state.second.clear(i);
     }
-    state.stats = DensityStats::zeros(300);
     let cameras: Vec<Camera> = (0..4)
         .map(|_| {
             let camera = random_camera(&mut rng, 40, 30);
@@ -38,7 +35,7 @@ fn begin(device: &mut dyn FitDevice, seed: u64) -> (Vec<Camera>, FitState) {
     (cameras, state)
 }
 
-/// One photo for longer than colours may wait, then all in turn; the degree grows, rates fall, some steps
+/// One photo for longer than colors may wait, then all in turn; the degree grows, rates fall, some steps
 /// move nothing.
 fn input(cameras: &[Camera], step: u32) -> StepInput {
     let view = if step <= STEPS / 2 + 10 { 0 } else { step as usize % cameras.len() };
@@ -52,21 +49,16 @@ fn input(cameras: &[Camera], step: u32) -> StepInput {
         sh_rest: 2.5e-4 * rate,
     };
     StepInput {
-        view,
-        camera: cameras[view],
         background: [0.2, 0.4, 0.6],
         sh_degree: [1, 2, 3][(step > GROWS[0]) as usize + (step > GROWS[1]) as usize],
         rates: if FROZEN.contains(&step) { Rates::ZERO } else { rates },
         step,
-        ssim_weight: 0.2,
         opacity_regularizer: 0.01,
         scale_regularizer: 0.01,
         noise: 10.0,
         dropout: 0.1,
         noise_seed: step.wrapping_mul(2_654_435_761),
-        camera_gradient: false,
-        exposure: None,
-        depth_weight: 0.0,
+        ..StepInput::new(view, cameras[view])
     }
 }
 
@@ -95,7 +87,7 @@ fn end(device: &mut dyn FitDevice, control: &[u32], resume: &[u32], frozen: usiz
     device.download().unwrap()
 }
 
-/// `device` makes a device whose colours wait for so many steps at most.
+/// `device` makes a device whose colors wait for at most this many steps.
 pub fn waiting_colors_end_with_the_same_bits<D: FitDevice>(device: impl Fn(usize) -> D) {
     let (cameras, before) = begin(&mut device(COLOR_WAIT), 31);
     let mut first = device(COLOR_WAIT);

@@ -1,18 +1,18 @@
-//! Files that are cut short, claim what they do not hold, or are something else: one sentence that
-//! names the file, and little memory.
+//! Truncated files, false claims, and other kinds of files: one message that names the file, and little
+//! memory.
 
 use std::io::Write;
 use std::path::Path;
 
 use flate2::Compression;
 use flate2::write::GzEncoder;
-use splat_render::io::parse_splats;
+use splat_render::io::{parse_splats, read_splats};
 
 use crate::layouts::{ksplat, sog_with, spz_4};
 use crate::memory::peak_of;
 use crate::scenes::{WRITABLE, bytes_of, folder, scene};
 
-/// Memory that no small file may take: what any file may unpack to, and as much again for copies.
+/// Memory limit for small files: the unpacking limit, and the same for copies.
 pub const MEMORY_MAX: usize = 160 << 20;
 
 /// The sentence about these bytes.
@@ -47,7 +47,7 @@ fn every_truncation_is_one_sentence() {
 }
 
 #[test]
-fn other_files_under_the_name_of_splats_are_refused() {
+fn other_files_with_the_ending_splat_are_refused() {
     let jpeg = [&[0xff, 0xd8, 0xff, 0xe0, 0, 16][..], b"JFIF\0", &[7; 200]].concat();
     for ending in WRITABLE.into_iter().chain(["ksplat"]) {
         let name = format!("photo.{ending}");
@@ -120,6 +120,22 @@ fn four_billion_splats_are_refused_before_memory_is_taken() {
 }
 
 #[test]
+fn wrong_ply_headers_are_refused() {
+    let ply = bytes_of(&folder("header"), "ply", &scene(3, 0));
+    let end = ply.windows(10).position(|w| w == b"end_header").unwrap();
+    let change = |from: &str, to: &str| {
+        let header = String::from_utf8_lossy(&ply[..end]).replace(from, to);
+        refused(&[header.as_bytes(), &ply[end..]].concat(), "a.ply")
+    };
+    assert!(change("vertex 3", "vertex 1000000000").contains("truncated"));
+    assert!(change("vertex 3", "vertex -3").contains("-3"));
+    assert!(change("binary_little_endian", "ascii").contains("ascii"));
+    assert!(change("float opacity", "float opazity").contains("opacity"));
+    let none = read_splats(Path::new("none.ply")).unwrap_err().to_string();
+    assert!(none.contains("opened"), "{none}");
+}
+
+#[test]
 fn gigabytes_of_zeros_are_not_unpacked() {
     // 256 MiB behind the header and four splats.
     let mut gzip = GzEncoder::new(Vec::new(), Compression::fast());
@@ -171,7 +187,7 @@ fn json_that_nests_or_points_anywhere_is_refused() {
 }
 
 #[test]
-fn json_takes_little_memory_however_it_is_made() {
+fn json_never_takes_much_memory() {
     let maps = format!("{{\"nodes\":[{}{{}}]}}", "{\"a\":0},".repeat(1_000_000));
     assert!(refused(maps.as_bytes(), "maps.gltf").contains("values"));
     // 20 MB of numbers, deflated to a hundredth.

@@ -69,9 +69,9 @@ pub fn ksplat(file: &SplatFile, level: u16) -> Vec<u8> {
     for _ in 0..partial {
         out.extend(1u32.to_le_bytes());
     }
-    let centre = |i: usize| splats.means[i / BUCKET * BUCKET].map(|c| (c * 4.0).round() / 4.0);
+    let center = |i: usize| splats.means[i / BUCKET * BUCKET].map(|c| (c * 4.0).round() / 4.0);
     for bucket in 0..full + partial {
-        out.extend(centre(bucket * BUCKET).into_iter().flat_map(f32::to_le_bytes));
+        out.extend(center(bucket * BUCKET).into_iter().flat_map(f32::to_le_bytes));
     }
     for i in 0..n {
         let push = |out: &mut Vec<u8>, value: f32| match level {
@@ -82,7 +82,7 @@ pub fn ksplat(file: &SplatFile, level: u16) -> Vec<u8> {
             match level {
                 0 => out.extend(splats.means[i][k].to_le_bytes()),
                 _ => {
-                    let steps = (splats.means[i][k] - centre(i)[k]) / (block / 2.0 / 32767.0);
+                    let steps = (splats.means[i][k] - center(i)[k]) / (block / 2.0 / 32767.0);
                     out.extend(((steps + 32767.0).round() as u16).to_le_bytes());
                 }
             }
@@ -114,7 +114,7 @@ pub fn ksplat(file: &SplatFile, level: u16) -> Vec<u8> {
 fn ksplat_of_every_level_and_degree() {
     for level in 0..3 {
         for degree in 0..=2 {
-            // All within 4 units of the bucket's centre.
+            // All within 4 units of the bucket's center.
             let mut file = scene(31, degree);
             for mean in &mut file.splats.means {
                 *mean = mean.map(|c| c / 2.0);
@@ -182,7 +182,7 @@ fn spz_header(splats: &SplatArrays, version: u32) -> Vec<u8> {
     out
 }
 
-/// What a `.spz` of version 2 holds before it is compressed.
+/// An uncompressed `.spz` of version 2.
 pub fn spz_2(splats: &SplatArrays) -> Vec<u8> {
     [spz_header(splats, 2), spz_arrays(splats, 2).concat()].concat()
 }
@@ -235,7 +235,7 @@ fn spz_of_every_version() {
             assert_eq!(loaded.notes.len(), usize::from(k >= 2));
             let apart = Apart::of(&file.splats, &loaded.file.splats);
             assert!(apart.mean <= 0.5 / 4096.0 + 1e-6, "{k}: {apart:?}");
-            // Version 2's w is off by more where it is small.
+            // Version 2's w has a larger error if it is small.
             assert!(apart.quat <= if k == 0 { 0.15 } else { 2.5e-3 }, "{k}: {apart:?}");
             assert!(apart.scale <= 1.0 / 32.0 + 1e-6 && apart.opacity <= 0.002, "{k}: {apart:?}");
             assert!(apart.rest <= 1.0 / 256.0 + 1e-6 && apart.color <= 0.0037, "{k}: {apart:?}");
@@ -248,7 +248,7 @@ fn spz_of_every_version() {
 /// Names and contents of a zip.
 pub type Entries = Vec<(String, Vec<u8>)>;
 
-/// What is in a `.sog`.
+/// Names and contents of a `.sog`.
 pub fn sog_entries(bytes: &[u8]) -> Entries {
     let mut zip = ZipArchive::new(Cursor::new(bytes)).unwrap();
     (0..zip.len())
@@ -310,67 +310,84 @@ fn sog_as_others_write_it() {
 
 // ---- glTF --------------------------------------------------------------------------------------
 
-/// A scene of two meshes: one turned, scaled and shifted by its node and the node above it, with
-/// interleaved rows and bytes for numbers; the other where it is, of a lower SH degree.
-#[test]
-fn gltf_as_others_write_it() {
-    let (one, two) = (scene(12, 2).splats, scene(5, 0).splats);
-    let mut binary = Vec::new();
-    let mut attributes = Vec::new();
-    let (mut views, mut accessors) = (Vec::new(), Vec::new());
-    for (splats, quantized) in [(&one, true), (&two, false)] {
-        let mut names = serde_json::Map::new();
-        let stride = splats.stride();
-        let mut push = |name: String, code: u32, width: usize, rows: Vec<Vec<u8>>| {
-            // Rows are 32 bytes apart where quantized.
-            let gap = if quantized { 32 } else { rows[0].len() };
-            let start = binary.len();
-            for mut row in rows.iter().cloned() {
-                row.resize(gap, 0xee);
-                binary.extend(row);
-            }
-            let mut view =
-                json!({ "buffer": 0, "byteOffset": start, "byteLength": binary.len() - start });
-            if quantized {
-                view["byteStride"] = json!(gap);
-            }
-            let kind = ["SCALAR", "VEC2", "VEC3", "VEC4"][width - 1];
-            names.insert(name, json!(accessors.len()));
-            accessors.push(json!({ "bufferView": views.len(), "componentType": code,
-                "count": rows.len(), "type": kind, "normalized": code != 5126 }));
-            views.push(view);
-        };
+/// Arrays of a glTF, as other programs write them.
+#[derive(Default)]
+struct Gltf {
+    binary: Vec<u8>,
+    views: Vec<Value>,
+    accessors: Vec<Value>,
+}
+
+impl Gltf {
+    /// Adds an array of rows, `gap` bytes apart if given; returns the number of its accessor.
+    fn push(&mut self, code: u32, width: usize, gap: Option<usize>, rows: Vec<Vec<u8>>) -> Value {
+        let start = self.binary.len();
+        for row in &rows {
+            self.binary.extend(row);
+            self.binary.resize(self.binary.len() + gap.map_or(0, |gap| gap - row.len()), 0xee);
+        }
+        let mut view = json!({ "buffer": 0, "byteOffset": start,
+            "byteLength": self.binary.len() - start });
+        if let Some(gap) = gap {
+            view["byteStride"] = json!(gap);
+        }
+        let kind = ["SCALAR", "VEC2", "VEC3", "VEC4"][width - 1];
+        self.accessors.push(json!({ "bufferView": self.views.len(), "componentType": code,
+            "count": rows.len(), "type": kind,
+            "normalized": code != 5126 }));
+        self.views.push(view);
+        json!(self.accessors.len() - 1)
+    }
+
+    /// Adds splats; returns the attributes. Quantized: interleaved rows of 32 bytes, and integers for
+    /// quats and opacities.
+    fn splats(&mut self, splats: &SplatArrays, quantized: bool) -> Value {
+        let gap = quantized.then_some(32);
         let floats = |row: &[f32]| row.iter().flat_map(|c| c.to_le_bytes()).collect::<Vec<u8>>();
         let key = |name: &str| format!("KHR_gaussian_splatting:{name}");
-        push("POSITION".into(), 5126, 3, splats.means.iter().map(|m| floats(m)).collect());
-        let xyzw = |q: &[f32; 4]| {
-            let [w, x, y, z] = unit(*q);
+        let mut names = serde_json::Map::new();
+        let means = splats.means.iter().map(|m| floats(m)).collect();
+        names.insert("POSITION".into(), self.push(5126, 3, gap, means));
+        let quats = splats.quats.iter().map(|&q| {
+            let [w, x, y, z] = unit(q);
             [x, y, z, w]
-        };
-        let quats = splats.quats.iter().map(xyzw);
-        if quantized {
+        });
+        let opacities = splats.opacities.iter().map(|&o| sigmoid(o));
+        let [quats, opacities] = if quantized {
             let short = |c: f32| ((c * 32767.0).round() as i16).to_le_bytes();
-            let rows = quats.map(|q| q.into_iter().flat_map(short).collect()).collect();
-            push(key("ROTATION"), 5122, 4, rows);
-            let rows = splats.opacities.iter().map(|&o| vec![byte(sigmoid(o))]).collect();
-            push(key("OPACITY"), 5121, 1, rows);
+            let quats = quats.map(|q| q.into_iter().flat_map(short).collect()).collect();
+            let opacities = opacities.map(|o| vec![byte(o)]).collect();
+            [self.push(5122, 4, gap, quats), self.push(5121, 1, gap, opacities)]
         } else {
-            push(key("ROTATION"), 5126, 4, quats.map(|q| floats(&q)).collect());
-            let rows = splats.opacities.iter().map(|&o| floats(&[sigmoid(o)])).collect();
-            push(key("OPACITY"), 5126, 1, rows);
-        }
-        let scales = splats.scales.iter().map(|s| floats(&s.map(f32::exp)));
-        push(key("SCALE"), 5126, 3, scales.collect());
+            let quats = quats.map(|q| floats(&q)).collect();
+            let opacities = opacities.map(|o| floats(&[o])).collect();
+            [self.push(5126, 4, gap, quats), self.push(5126, 1, gap, opacities)]
+        };
+        names.insert(key("ROTATION"), quats);
+        names.insert(key("OPACITY"), opacities);
+        let scales = splats.scales.iter().map(|s| floats(&s.map(f32::exp))).collect();
+        names.insert(key("SCALE"), self.push(5126, 3, gap, scales));
         for degree in 0..=splats.sh_degree {
             let start = if degree == 0 { 0 } else { sh::coeffs(degree - 1) };
             for k in start..sh::coeffs(degree) {
-                let rows = splats.sh.iter().skip(k).step_by(stride).map(|rgb| floats(rgb));
+                let rows = splats.sh.iter().skip(k).step_by(splats.stride());
+                let rows = rows.map(|rgb| floats(rgb)).collect();
                 let name = key(&format!("SH_DEGREE_{degree}_COEF_{}", k - start));
-                push(name, 5126, 3, rows.collect());
+                names.insert(name, self.push(5126, 3, gap, rows));
             }
         }
-        attributes.push(names);
+        names.into()
     }
+}
+
+/// Two meshes: the first quantized, and moved, turned and scaled by its node and the node's parent; the
+/// second of SH degree 0.
+#[test]
+fn gltf_as_others_write_it() {
+    let (one, two) = (scene(12, 2).splats, scene(5, 0).splats);
+    let mut arrays = Gltf::default();
+    let attributes = [arrays.splats(&one, true), arrays.splats(&two, false)];
+    let Gltf { binary, views, accessors } = arrays;
     let turn = DQuat::from_axis_angle(DVec3::new(0.6, 0.0, 0.8), 0.7);
     let far = 1e6 + 0.125;
     let primitive = |k: usize| {

@@ -1,4 +1,4 @@
-//! Splat files of every format: what comes back, what is said, and what damage does.
+//! Splat files of every format: round trips, notes, and damage.
 
 mod hostile;
 mod layouts;

@@ -48,7 +48,7 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static COUNTING: Counting = Counting;
 
-/// What `work` returns, and the most bytes that this thread held in it beyond what it held before.
+/// The result of `work`, and the peak of additional bytes that this thread allocated.
 pub fn peak_of<T>(work: impl FnOnce() -> T) -> (T, usize) {
     let before = TAKEN.get();
     PEAK.set(before);
@@ -57,7 +57,7 @@ pub fn peak_of<T>(work: impl FnOnce() -> T) -> (T, usize) {
 }
 
 #[test]
-fn what_is_freed_counts_too() {
+fn freed_memory_counts() {
     let ((), peak) = peak_of(|| drop(vec![1u8; 5 << 20]));
     assert!((5 << 20..6 << 20).contains(&peak), "{peak}");
     let (_, peak) = peak_of(|| vec![0u8; 1 << 20]);

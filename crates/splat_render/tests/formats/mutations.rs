@@ -66,7 +66,7 @@ fn mutate(bytes: &mut Vec<u8>, numbers: &mut Numbers) {
     }
 }
 
-/// Runs the cases of one file. `wrap` puts what was changed into its container.
+/// Runs the cases of one file. `wrap` puts changed bytes into their container.
 fn run(name: &str, seed_bytes: &[u8], wrap: impl Fn(Vec<u8>) -> Vec<u8>) {
     let cases = match std::env::var("IGSR_FUZZ_CASES") {
         Ok(cases) => cases.parse().expect("IGSR_FUZZ_CASES must be a number"),
@@ -141,7 +141,7 @@ fn ksplat_of_all_levels() {
     for level in 0..3 {
         let name = format!("mutated{level}.ksplat");
         run(&name, &ksplat(&scene(5, 2), level), as_it_is);
-        // The headers are mostly empty: changes to what is in use count for more.
+        // The headers are mostly empty: change the used parts more often.
         let whole = ksplat(&scene(5, 2), level);
         run(&name, &whole[4096..4096 + 48], |section| {
             let mut bytes = whole.clone();

@@ -1,16 +1,16 @@
-//! What a format cannot hold is said, and the rest is written.
+//! Omitted content is noted, and the rest is written.
 
 use splat_render::io::write_splats;
 
 use crate::scenes::{WRITABLE, by_way_of, folder, scene};
 
 #[test]
-fn what_is_lost_is_said() {
+fn losses_are_noted() {
     let folder = folder("lost");
     let mut file = scene(20, 4);
     file.origin = [1000.0, 0.0, 0.0];
     file.antialiased = true;
-    // What each ending must mention, and whether it drops SH of degree 4.
+    // The words that each ending's notes must contain, and whether it drops SH of degree 4.
     let wanted: [(&str, &[&str], u32); 7] = [
         ("ply", &[], 4),
         ("compressed.ply", &["degree 4"], 3),
@@ -28,7 +28,7 @@ fn what_is_lost_is_said() {
             assert!(note.ends_with('.') && !note.contains('\n'), "{note}");
         }
         assert_eq!(loaded.file.splats.sh_degree, degree, "{ending}");
-        // Wherever the origin is kept, the splats are where they were.
+        // With a stored origin, splats keep their places.
         let mean: f64 =
             loaded.file.splats.means.iter().map(|m| f64::from(m[0])).sum::<f64>() / 20.0;
         assert!((mean + loaded.file.origin[0] - 1000.0).abs() < 3.0, "{ending}");
@@ -36,7 +36,7 @@ fn what_is_lost_is_said() {
 }
 
 #[test]
-fn splats_that_are_not_drawn_are_left_out_and_the_rest_is_written() {
+fn invisible_splats_are_left_out_and_the_rest_is_written() {
     let folder = folder("nan");
     let mut file = scene(20, 1);
     file.splats.means[3][1] = f32::NAN;
@@ -51,7 +51,7 @@ fn splats_that_are_not_drawn_are_left_out_and_the_rest_is_written() {
             continue;
         }
         assert_eq!(loaded.file.splats.len(), 15, "{ending}");
-        assert!(notes.iter().any(|note| note.starts_with("5 splats that no renderer draws")));
+        assert!(notes.iter().any(|note| note.starts_with("5 splats that cannot be drawn")));
     }
 }
 
@@ -73,20 +73,23 @@ fn values_beyond_the_range_are_clipped_and_counted() {
             .collect::<Vec<_>>()
     };
     assert_eq!(counts("compressed.ply"), [2, 1]); // log-scales beyond 20, SH beyond 4
-    assert_eq!(counts("splat"), [1]); // colours
+    assert_eq!(counts("splat"), [1]); // colors
     assert_eq!(counts("spz"), [2, 2, 2]); // DC, log-scales, SH
     assert_eq!(counts("sog"), [0usize; 0]);
     assert_eq!(counts("glb"), [0usize; 0]);
 }
 
 #[test]
-fn positions_too_far_for_a_format_are_an_error_that_names_the_mend() {
+fn positions_out_of_a_format_s_range_are_refused() {
     let path = folder("far").join("far.spz");
     let mut file = scene(3, 0);
     file.splats.means[1][2] = 1e9;
     let error = write_splats(&path, &file).unwrap_err().to_string();
     assert!(error.contains(".spz") && error.contains(".ply"), "{error}");
     assert!(!path.exists());
+    // Nor does another error leave a temporary file.
+    assert!(write_splats(&path.join("scene.ply"), &file).is_err());
+    assert_eq!(std::fs::read_dir(path.parent().unwrap()).unwrap().count(), 0);
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! What comes back of a scene is within the steps of the format's numbers.
+//! Round trips are within the steps of the format's numbers.
 
 use splat_render::io::{Format, read_splats, write_splats};
 
@@ -15,7 +15,7 @@ fn smallest_three(e: f32) -> f32 {
 }
 
 #[test]
-fn ply_returns_every_bit() {
+fn ply_keeps_every_bit() {
     for degree in 0..=4 {
         let mut file = scene(N, degree);
         file.origin = [1e6, -0.1, 1.0 / 3.0];
@@ -38,7 +38,7 @@ fn compressed_ply_is_within_its_steps() {
         assert_eq!((loaded.file.origin, loaded.file.antialiased), (file.origin, true));
         assert!(notes.is_empty(), "{notes:?}");
         let apart = Apart::of(&file.splats, &loaded.file.splats);
-        // 10 bits at least over a chunk, which is no larger than the scene.
+        // At least 10 bits over a chunk, whose size is at most the scene's.
         assert!(apart.mean <= 6.0 / 1023.0 / 2.0 + 1e-6, "{apart:?}");
         assert!(apart.scale <= 6.0 / 1023.0 / 2.0 + 1e-6, "{apart:?}");
         assert!(apart.quat <= smallest_three(2.0f32.sqrt() / 1023.0 / 2.0), "{apart:?}");
@@ -107,7 +107,7 @@ fn sog_is_within_its_steps() {
 }
 
 #[test]
-fn sog_palettes_find_the_kinds_that_splats_are_of() {
+fn sog_palettes_find_the_clusters() {
     // 3 000 splats of 40 kinds, in 1 024 rows.
     let mut file = scene(3000, 3);
     let stride = file.splats.stride();
@@ -148,7 +148,7 @@ fn gltf_rounds_only_what_it_transforms() {
 }
 
 #[test]
-fn no_splats_and_one_splat_and_saturated_ones_are_scenes_too() {
+fn empty_tiny_and_saturated_scenes_are_written() {
     let folder = folder("few");
     for ending in WRITABLE {
         for n in [0, 1] {
@@ -176,7 +176,7 @@ fn no_splats_and_one_splat_and_saturated_ones_are_scenes_too() {
 }
 
 #[test]
-fn content_counts_and_not_the_ending() {
+fn the_content_decides_the_format() {
     let folder = folder("content");
     let file = scene(20, 1);
     for (ending, other) in [("spz", "ply"), ("sog", "spz"), ("glb", "splat"), ("ply", "glb")] {

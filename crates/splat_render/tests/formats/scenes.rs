@@ -31,7 +31,7 @@ impl Numbers {
     }
 }
 
-/// Splats as fits leave them: all values within what every format can hold.
+/// Typical fitted splats: all values are within every format's range.
 pub fn scene(n: usize, degree: u32) -> SplatFile {
     let mut numbers = Numbers(7 + u64::from(degree));
     let mut splats = SplatArrays::zeros(n, degree);
@@ -56,7 +56,7 @@ pub fn folder(name: &str) -> PathBuf {
     path
 }
 
-/// What comes back of `file` by way of a file of this ending, and what was said.
+/// Writes and reads `file` with this ending; returns the content and the writer's notes.
 pub fn by_way_of(folder: &Path, ending: &str, file: &SplatFile) -> (Loaded, Vec<String>) {
     let path = folder.join(format!("scene.{ending}"));
     let notes = write_splats(&path, file).unwrap();
@@ -70,8 +70,7 @@ pub fn bytes_of(folder: &Path, ending: &str, file: &SplatFile) -> Vec<u8> {
     std::fs::read(path).unwrap()
 }
 
-/// The largest differences between two scenes of as many splats, each paired with the other's
-/// nearest.
+/// The largest differences between two scenes of the same size, each splat paired with its nearest.
 #[derive(Debug, Default)]
 pub struct Apart {
     pub mean: f32,
@@ -80,7 +79,7 @@ pub struct Apart {
     pub opacity: f64,
     pub color: f64,
     pub rest: f32,
-    /// Root of the mean square of what `rest` is the largest of.
+    /// Root mean square of the differences whose maximum is `rest`.
     pub rest_rms: f64,
 }
 

@@ -1,5 +1,5 @@
-//! What DX12's older compiler (FXC, which every Windows has) refuses or compiles wrongly, looked for in
-//! naga's IR. FXC itself runs on Windows alone.
+//! Patterns that DX12's older compiler (FXC) refuses or miscompiles, found in naga's IR. FXC itself runs
+//! only on Windows.
 
 use naga::proc::TypeResolution;
 use naga::valid::{FunctionInfo, ModuleInfo};
@@ -87,8 +87,8 @@ impl Walk<'_> {
         }
     }
 
-    /// A component of a vector or matrix that is picked at run time is no l-value to FXC, unless the
-    /// loop around it is unrolled. Storage buffers are written by address.
+    /// FXC cannot assign to a component picked at run time, unless the loop around it is unrolled.
+    /// Storage buffers are written by address.
     fn store(&mut self, pointer: Handle<Expression>) {
         let mut at = pointer;
         let mut picks = false;
@@ -142,7 +142,7 @@ fn takes_gradient(expression: &Expression) -> bool {
     }
 }
 
-/// What a function, and those it calls, may not do where it is called in a loop.
+/// Violations of a function, including its callees, if called in a loop.
 fn in_loops(module: &Module, function: Handle<Function>) -> Vec<&'static str> {
     let function = &module.functions[function];
     let mut found = Vec::new();

@@ -1,5 +1,5 @@
-//! What the shaders ask of a device, read off naga's IR: no more than WebGPU's default limits, which
-//! every adapter that wgpu calls conformant has.
+//! The shaders' requirements, from naga's IR: within WebGPU's default limits, which every conformant
+//! adapter has.
 
 use naga::proc::Layouter;
 use naga::{AddressSpace, Binding, ImageClass, TypeInner};
@@ -78,13 +78,13 @@ fn used(shader: &Compiled) -> Use {
 #[test]
 fn shaders_ask_for_no_more_than_the_default_limits() {
     let limits = wgpu::Limits::default();
-    // What the documentation promises, should wgpu raise its defaults.
+    // The documented limits, in case wgpu raises its defaults.
     assert!(limits.max_storage_buffers_per_shader_stage <= 8);
     assert!(limits.max_compute_workgroup_storage_size <= 16 << 10);
     assert!(limits.max_compute_invocations_per_workgroup <= 256);
     assert!(limits.max_storage_buffer_binding_size <= 128 << 20);
     assert!(needed_limits().check_limits(&limits));
-    // What an adapter is refused for is what the kernels need; the viewer asks for its own textures.
+    // The kernels' needs equal the limits for refusal; the viewer requests its textures itself.
     let limits = needed_limits();
     let textures = wgpu::Limits::default();
     for shader in compiled() {

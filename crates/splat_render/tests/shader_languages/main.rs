@@ -1,6 +1,6 @@
-//! Every shader, in every variant that some adapter compiles, written in the languages of all drivers:
-//! SPIR-V for Vulkan, HLSL for DX12's two compilers, MSL for Metal. The viewer's shaders too. No adapter
-//! is needed. Debian's validators read what naga wrote: `make test` installs them.
+//! Every shader in every variant, translated to the languages of all drivers: SPIR-V for Vulkan, HLSL for
+//! DX12's two compilers, MSL for Metal; the viewer's too. No adapter is needed. Debian's validators check
+//! naga's output: `make test` installs them.
 
 mod fxc_rules;
 mod limits;
@@ -28,7 +28,7 @@ fn validator(subgroups: bool) -> Validator {
     validator
 }
 
-/// The viewer's shaders. Its files are listed here with what precedes their text there.
+/// The viewer's shaders, listed with their prefixes.
 fn viewer_variants() -> Vec<ShaderVariant> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../splat_view/src");
     let known = [("blend", shared_wgsl()), ("canvas", String::new()), ("compose", String::new())];
@@ -198,9 +198,8 @@ fn the_spirv_is_valid() {
     }
 }
 
-/// What naga writes and glslang does not read, in other words. glslang puts the code of a global's
-/// initializer into the function that it calls, and then finds that function to call itself: a list of
-/// the same values it takes. And it does not cast zero to an array.
+/// Rewrites naga's output that glslang does not accept: an initializer of a global that calls a function,
+/// and a cast of zero to an array.
 fn for_glslang(hlsl: &str) -> String {
     let lines = hlsl.lines().map(|line| match line.split_once(" = ") {
         Some((constant, call)) if line.starts_with("static const") => {

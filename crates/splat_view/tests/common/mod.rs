@@ -1,10 +1,11 @@
-//! What the tests share: made-up scenes, folders that vanish, and the program.
+//! Shared by the tests: random scenes, temporary folders, and the program.
 
 #![allow(dead_code, reason = "each test file uses its own part")]
 
 #[cfg(target_os = "linux")]
 pub mod dragging;
 
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -13,8 +14,9 @@ use glam::{DMat4, DVec3};
 use splat_render::Camera;
 use splat_render::fit::SplatArrays;
 use splat_render::io::{SplatFile, write_splats};
+use splat_render::levels::write_levels;
 
-/// A new folder that goes away with this.
+/// A new folder, deleted on drop.
 pub struct Folder(pub PathBuf);
 
 impl Folder {
@@ -38,7 +40,7 @@ impl Drop for Folder {
     }
 }
 
-/// Numbers in 0..1 that are the same in every run.
+/// Pseudorandom numbers in 0..1.
 pub struct Numbers(u64);
 
 impl Numbers {
@@ -53,7 +55,7 @@ impl Numbers {
     }
 }
 
-/// Splats of SH degree 1 in a ball about the origin, of colours about `tint`.
+/// Splats of SH degree 1 in a ball about the origin, of colors about `tint`.
 pub fn ball(count: usize, seed: u64, tint: [f32; 3]) -> SplatFile {
     let mut n = Numbers(seed);
     let mut splats = SplatArrays { sh_degree: 1, ..SplatArrays::default() };
@@ -81,7 +83,69 @@ pub fn write(path: &Path, file: &SplatFile) {
     write_splats(path, file).expect("a splat file");
 }
 
-/// A file of cameras as igsr writes it, with photos that are not there.
+/// A ply in a new folder.
+pub fn saved(file: &SplatFile) -> (Folder, PathBuf) {
+    let folder = Folder::new();
+    let scene = folder.join("scene.ply");
+    write(&scene, file);
+    (folder, scene)
+}
+
+/// Writes a scene to the folder, and its levels of detail to the folder's `levels`.
+pub fn write_in_levels(folder: &Folder, file: &SplatFile) -> PathBuf {
+    let (scene, levels) = (folder.join("scene.ply"), folder.join("levels"));
+    write(&scene, file);
+    std::fs::create_dir(&levels).expect("a folder");
+    write_levels(&scene, &levels, 3, 200, &mut || true).expect("levels");
+    levels
+}
+
+/// A checkpoint as numpy's savez writes it.
+pub fn write_checkpoint(path: &Path, file: &SplatFile) {
+    let mut zip = zip::ZipWriter::new(std::fs::File::create(path).expect("file"));
+    let stored =
+        zip::write::SimpleFileOptions::default().compression_method(zip::CompressionMethod::Stored);
+    let mut member = |name: &str, kind: &str, shape: &str, data: Vec<u8>| {
+        let mut header =
+            format!("{{'descr': '{kind}', 'fortran_order': False, 'shape': ({shape}), }}");
+        while !(header.len() + 11).is_multiple_of(64) {
+            header.push(' ');
+        }
+        header.push('\n');
+        zip.start_file(format!("{name}.npy"), stored).expect("member");
+        zip.write_all(b"\x93NUMPY\x01\x00").expect("write");
+        zip.write_all(&(header.len() as u16).to_le_bytes()).expect("write");
+        zip.write_all(header.as_bytes()).expect("write");
+        zip.write_all(&data).expect("write");
+    };
+    let floats = |values: &[f32]| values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>();
+    let (s, n) = (&file.splats, file.splats.len());
+    member("means", "<f4", &format!("{n}, 3"), floats(s.means.as_flattened()));
+    member("quats", "<f4", &format!("{n}, 4"), floats(s.quats.as_flattened()));
+    member("scales", "<f4", &format!("{n}, 3"), floats(s.scales.as_flattened()));
+    member("opacities", "<f4", &format!("{n},"), floats(&s.opacities));
+    member("sh", "<f4", &format!("{n}, {}, 3", s.stride()), floats(s.sh.as_flattened()));
+    let origin = file.origin.iter().flat_map(|v| v.to_le_bytes()).collect();
+    member("origin", "<f8", "3,", origin);
+    zip.finish().expect("zip");
+}
+
+/// A camera 4 units off, with its middle elsewhere than the picture's.
+pub fn camera() -> Camera {
+    Camera {
+        viewmat: DMat4::from_translation(DVec3::new(0.1, -0.2, 4.0))
+            * DMat4::from_rotation_y(0.6)
+            * DMat4::from_rotation_x(0.3),
+        fx: 110.0,
+        fy: 100.0,
+        cx: 60.0,
+        cy: 35.0,
+        width: 120,
+        height: 80,
+    }
+}
+
+/// A file of cameras in igsr's format, with missing photos.
 pub fn cameras_json(cameras: &[Camera]) -> String {
     let frame = |(i, camera): (usize, &Camera)| {
         let to_world = camera.viewmat.inverse() * DMat4::from_scale(DVec3::new(1.0, -1.0, -1.0));
@@ -96,7 +160,7 @@ pub fn cameras_json(cameras: &[Camera]) -> String {
     format!("{{\"camera_model\": \"PINHOLE\", \"frames\": [{}]}}", frames.join(", "))
 }
 
-/// Writes that file.
+/// Writes [`cameras_json`].
 pub fn write_cameras(path: &Path, cameras: &[Camera]) {
     std::fs::write(path, cameras_json(cameras)).expect("cameras");
 }
@@ -111,29 +175,40 @@ pub fn program() -> Command {
     command
 }
 
-/// Runs the program, and asserts that it ends well.
-pub fn run(arguments: &[&dyn AsRef<std::ffi::OsStr>]) -> Output {
-    let output = program().args(arguments).output().expect("splat-view starts");
-    assert!(
-        output.status.success(),
-        "{arguments:?}: {}",
-        said(&output),
-        arguments = words(arguments)
-    );
+/// The program with a scene and options, which are separated by spaces.
+pub fn command(scene: &Path, options: &str) -> Command {
+    let mut command = program();
+    command.arg(scene).args(options.split_whitespace());
+    command
+}
+
+/// Runs a command, and asserts that it succeeds.
+pub fn run(command: &mut Command) -> Output {
+    let output = command.output().expect("splat-view starts");
+    assert!(output.status.success(), "{command:?}: {}", said(&output));
     output
 }
 
-fn words(arguments: &[&dyn AsRef<std::ffi::OsStr>]) -> Vec<String> {
-    arguments.iter().map(|a| a.as_ref().to_string_lossy().into_owned()).collect()
+/// Draws a scene on the CPU; returns the picture, and the program's messages.
+pub fn draw(scene: &Path, options: &str) -> (Picture, String) {
+    let out = scene.with_extension("drawn.png");
+    let mut command = command(scene, options);
+    let output = run(command.args(["--backend", "cpu", "--screenshot"]).arg(&out));
+    (read_png(&out), said(&output))
 }
 
-/// What the program said.
+/// The program's messages.
 pub fn said(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).trim_end().to_owned()
 }
 
-/// Asserts that the program ended with one error message that contains the words.
-pub fn refused(output: &Output, words: &[&str]) {
+/// Asserts that a command ends with one error message that contains the words.
+pub fn refused(command: &mut Command, words: &[&str]) {
+    refused_with(&command.output().expect("splat-view starts"), words);
+}
+
+/// [`refused`] of a command that has ended.
+pub fn refused_with(output: &Output, words: &[&str]) {
     let text = said(output);
     assert_eq!(output.status.code(), Some(1), "{text}");
     assert_eq!(text.lines().count(), 1, "not one message: {text}");

@@ -7,9 +7,9 @@ use crate::camera::Camera;
 /// Cameras nearer together than this part of their distance to the scene stand at one place.
 const ONE_PLACE: f64 = 1e-3;
 
-/// Moves all cameras by the similarity that brings them nearest to where they began: orientations
-/// on average, centres in the least-squares sense. Cameras that stand at one place, seen from their
-/// distances to the scene, have no scale to keep.
+/// Moves all cameras by the similarity that brings them nearest to their initial poses: orientations on
+/// average, centers in the least-squares sense. Cameras with a common center, compared to their distances
+/// to the scene, keep no scale.
 pub(super) fn anchor(now: &mut [Camera], initial: &[Camera], distances: &[f64]) {
     let n = now.len() as f64;
     // World turns that take each camera's orientation back; all are small, so that signs agree.

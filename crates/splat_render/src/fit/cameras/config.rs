@@ -22,7 +22,7 @@ pub struct CameraConfig {
     pub focal: Focal,
     /// Adam's rate at the start, in pixels that a step moves the picture by.
     pub rate: f32,
-    /// What the rate has decayed to at the end of the fit, as a part of the start's.
+    /// Final rate as a fraction of the initial rate.
     pub decay: f32,
     /// Part of the fit's steps in which cameras rest: the splats need a shape first.
     pub warm_up: f32,
@@ -50,10 +50,10 @@ impl CameraConfig {
             return Err(Error::argument("camera_rate", "must be finite and not negative"));
         }
         if !(self.decay > 0.0 && self.decay <= 1.0) {
-            return Err(Error::argument("camera_decay", "must lie above 0 and at most at 1"));
+            return Err(Error::argument("camera_decay", "must be above 0 and at most 1"));
         }
         if !(0.0..=1.0).contains(&self.warm_up) {
-            return Err(Error::argument("camera_warm_up", "must lie in 0..=1"));
+            return Err(Error::argument("camera_warm_up", "must be in 0..=1"));
         }
         Ok(())
     }

@@ -1,12 +1,11 @@
-//! Cameras under optimisation: poses and focal lengths that are not exact, fitted with the splats.
+//! Camera optimization: inexact poses and focal lengths are fitted together with the splats.
 //!
-//! A camera turns about its own centre and moves along its own axes. Both show the scene in nearly
-//! the same way, so Adam does not work on them but on coordinates in which every unit step moves the
-//! picture of the scene by one pixel, whichever way it points (as CamP, Park et al. 2023).
+//! A camera turns about its center and moves along its axes. Both change the picture in nearly the same
+//! way, so Adam works in coordinates in which a unit step in any direction moves the picture by one pixel
+//! (as CamP, Park et al. 2023).
 //!
-//! Cameras and splats together may be turned, moved and scaled without any photo showing it. After
-//! each round the cameras are brought back by the similarity that fits them best to where they
-//! began, so that they do not drift.
+//! A similarity of cameras and splats together changes no photo. After each round the cameras are moved
+//! by the similarity that fits them best to their initial poses, so that they do not drift.
 
 mod anchor;
 mod cholesky;
@@ -32,8 +31,7 @@ use motion::{POSE, PoseMatrix, move_by, tangent};
 use preconditioning::{all_scales, focal_pixels};
 use rigs::Rigs;
 
-/// Adam's decay of the first and second moments and its epsilon. A camera has one step a round: the
-/// second moment must forget within tens of them.
+/// Adam's betas and epsilon. A camera has one step per round, so moments must decay within tens of steps.
 const ADAM: (f64, f64, f64) = (0.9, 0.99, 1e-15);
 
 /// Everything needed to go on bit for bit; one entry per camera.
@@ -43,8 +41,7 @@ pub struct CameraState {
     pub viewmats: Vec<DMat4>,
     /// (fx, fy, cx, cy), pixels.
     pub intrinsics: Vec<[f64; 4]>,
-    /// Adam's first moments: the pose's six, then that of the focal length's logarithm (a shared
-    /// one's in every row alike).
+    /// Adam's first moments: six of the pose, then the log of the focal length (shared in all rows).
     pub first: Vec<[f64; 7]>,
     /// Adam's second moments: the pose's as a whole, the focal length's.
     pub second: Vec<[f64; 2]>,
@@ -64,9 +61,9 @@ pub struct Cameras {
     /// From steps in pixels to turns and moves.
     scales: Vec<PoseMatrix>,
     rigs: Rigs,
-    /// One per camera; empty where nothing is known.
+    /// One per camera, or empty.
     priors: Vec<PosePrior>,
-    /// Pixels by which the picture moves where the logarithm of the focal length grows by 1.
+    /// Pixels by which the picture moves if the focal length's logarithm grows by 1.
     focal_pixels: Vec<f64>,
     config: CameraConfig,
     state: CameraState,
@@ -100,7 +97,7 @@ impl Cameras {
     ///
     /// # Errors
     /// [`Error::Argument`] if there is not a number for each, or cameras of one number do not share a
-    /// centre.
+    /// center.
     pub fn set_rigs(&mut self, numbers: &[u32]) -> Result<()> {
         self.rigs = Rigs::new(&self.initial, numbers, &self.state.distances)?;
         self.scales = all_scales(&self.initial, &self.state.distances, &self.priors, &self.rigs);
@@ -108,9 +105,6 @@ impl Cameras {
     }
 
     /// Sets the pose priors, one for each camera, before the first step or [`Cameras::resume`].
-    ///
-    /// # Errors
-    /// [`Error::Argument`] if they are not one per camera or one of them cannot be used.
     pub fn set_pose_priors(&mut self, priors: Vec<PosePrior>) -> Result<()> {
         if priors.len() != self.initial.len() {
             let count = self.initial.len();
@@ -122,7 +116,7 @@ impl Cameras {
         for (k, prior) in priors.iter().enumerate() {
             prior.validate(k)?;
         }
-        // What is known of a rig is what is known of its cameras together.
+        // A rig's prior is the sum of its cameras' priors.
         let known: Vec<PoseMatrix> = priors.iter().map(|prior| prior.pose).collect();
         let known = self.rigs.sums(&known, false);
         self.priors = priors;
@@ -165,7 +159,7 @@ impl Cameras {
         Ok(())
     }
 
-    /// Where the fit stands.
+    /// The state needed to resume.
     pub fn state(&self) -> CameraState {
         let intrinsics = |c: &Camera| [c.fx, c.fy, c.cx, c.cy];
         CameraState {
@@ -185,11 +179,11 @@ impl Cameras {
         progress >= f64::from(self.config.warm_up)
     }
 
-    /// Adds gradients of steps to those of the round.
+    /// Adds gradients of steps to the round's.
     pub fn add(&mut self, gradients: &[CameraGradient]) {
         for gradient in gradients {
             let row = tangent(&self.now[gradient.view], gradient);
-            // A picture that left f32 says nothing of where to go.
+            // A picture outside f32's range gives no direction.
             if row.iter().all(|v| v.is_finite()) {
                 for (sum, v) in self.state.gradients[gradient.view].iter_mut().zip(row) {
                     *sum += v;
@@ -221,7 +215,7 @@ impl Cameras {
                 _ => self.focal_pixels[k],
             };
             let prior = self.priors.get(k).copied();
-            // A step is as long as the shorter of a pixel and what is known already.
+            // A step is at most a pixel and at most the prior's standard deviation.
             let pixels = prior.map_or(pixels, |prior| pixels.hypot(prior.log_focal.sqrt()));
             let mut in_pixels = [0.0; POSE + 1];
             for (line, v) in scale.iter().zip(row) {
@@ -256,9 +250,8 @@ impl Cameras {
         self.rigs.keep(&mut self.now);
     }
 
-    /// Adam with one second moment for the pose as a whole: its coordinates have one unit, and the
-    /// slope says how far to go along each of them. A moment for each would move the camera as far
-    /// along those that the photo hardly shows.
+    /// Adam with one second moment for the whole pose, whose coordinates have one unit: separate moments
+    /// would move the camera as far along directions that the photo hardly constrains.
     fn adam(&mut self, k: usize, gradient: [f64; 7], rate: f64) -> [f64; 7] {
         let (beta1, beta2, epsilon) = ADAM;
         let bias = |beta: f64| 1.0 - beta.powi(self.state.rounds.min(i32::MAX as u32) as i32);

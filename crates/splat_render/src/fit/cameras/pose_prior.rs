@@ -1,9 +1,9 @@
-//! Pose priors: what is known of a camera besides the photos' colours.
+//! Pose priors: knowledge of a camera that does not come from the photos' colors.
 //!
-//! Points that were matched in several photos tell a camera's pose to hundredths of a pixel, which
-//! the colours of a fit do not. A camera with a prior takes small steps along what is known and steps
-//! as large as ever along what is not. It is also drawn back towards the prior's mean: so far that a
-//! steady push ends one standard deviation away.
+//! Points matched in several photos determine a camera's pose to hundredths of a pixel, which the colors
+//! of a fit do not. A camera with a prior takes small steps along directions that the prior constrains
+//! and normal steps along the rest. It is also pulled toward the prior's mean, so strongly that a steady
+//! push ends one standard deviation away.
 
 use glam::DMat4;
 
@@ -19,18 +19,15 @@ pub struct PosePrior {
     pub viewmat: DMat4,
     /// Means of the focal lengths, pixels.
     pub focal: [f64; 2],
-    /// Inverse of the covariance of the rotation (radians) about and the translation (world units)
-    /// along x, y, z of the camera; symmetric, zero where nothing is known.
+    /// Inverse of the covariance of the rotation (radians) about and the translation (world units) along
+    /// x, y, z of the camera; symmetric, zero if unknown.
     pub pose: PoseMatrix,
-    /// Inverse of the variance of the focal length's logarithm; zero where nothing is known.
+    /// Inverse of the variance of the focal length's logarithm; zero if unknown.
     pub log_focal: f64,
 }
 
 impl PosePrior {
     /// Checks that every entry can be used; `k` is the camera's number.
-    ///
-    /// # Errors
-    /// [`Error::Argument`] that names `holds[k]`.
     pub fn validate(&self, k: usize) -> Result<()> {
         let information = self.pose.as_flattened().iter().chain([&self.log_focal]);
         let diagonal = (0..POSE).map(|i| self.pose[i][i]).chain([self.log_focal]);
@@ -47,10 +44,8 @@ impl PosePrior {
         Ok(())
     }
 
-    /// Draws a camera back by what balances a push of `rate` one standard deviation away.
-    ///
-    /// `scale` takes steps of length 1 to poses; they are made with this prior's information, so that
-    /// none goes further than a standard deviation.
+    /// Pulls a camera toward the prior's mean so that a push of `rate` balances one standard deviation
+    /// away. `scale` converts unit steps to poses and includes this prior's information.
     pub fn pull_pose(&self, camera: &mut Camera, scale: &PoseMatrix, rate: f64) {
         if self.pose == [[0.0; POSE]; POSE] {
             return;

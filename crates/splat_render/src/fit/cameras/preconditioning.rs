@@ -1,5 +1,4 @@
-//! Coordinates in which cameras take their steps: each step of length 1 moves the picture of the scene
-//! by one pixel, whichever way it points (CamP, Park et al. 2023).
+//! Coordinates for camera steps: a unit step moves the picture by one pixel (CamP, Park et al. 2023).
 
 use glam::DVec3;
 
@@ -9,8 +8,7 @@ use super::pose_prior::PosePrior;
 use super::rigs::Rigs;
 use crate::camera::Camera;
 
-/// Depths, in units of the scene's, and picture positions, in units of its size, of the points whose
-/// motion in the picture measures a step.
+/// Relative depths and picture positions of the points whose motion measures a step.
 const DEPTHS: [f64; 3] = [0.8, 1.0, 1.25];
 const POSITIONS: [f64; 5] = [0.1, 0.3, 0.5, 0.7, 0.9];
 
@@ -46,15 +44,14 @@ pub(super) fn all_scales(
         let each = measures.iter().enumerate();
         return each.map(|(k, sum)| pixels_to_pose(sum, priors.get(k))).collect();
     }
-    // The priors of a rig's cameras are those of the whole rig already.
+    // The priors of a rig's cameras already belong to the whole rig.
     let whole = rigs.sums(&measures, true);
     let each = whole.iter().enumerate();
     let scales: Vec<_> = each.map(|(k, sum)| pixels_to_pose(sum, priors.get(k))).collect();
     (0..cameras.len()).map(|k| rigs.rows_at(k, &scales)).collect()
 }
 
-/// Median depth of the points that a camera has in its picture; of all before it, where it has none
-/// there; 1 where there are none at all.
+/// Median depth of the points in a camera's picture; else of all points in front of it; else 1.
 pub fn scene_distance(camera: &Camera, means: &[[f32; 3]]) -> f64 {
     let (w, h) = (f64::from(camera.width), f64::from(camera.height));
     let (mut seen, mut before) = (Vec::new(), Vec::new());
@@ -101,9 +98,9 @@ fn measure(camera: &Camera, distance: f64) -> PoseMatrix {
     sum
 }
 
-/// A matrix from steps in pixels to poses: what it makes of a unit step moves points of the picture by
-/// one pixel in root mean square. A move comes with the turn that keeps the picture in place. Along
-/// what a prior knows to less than a pixel, it moves them by that.
+/// A matrix from steps in pixels to poses: a unit step moves points of the picture by one pixel in root
+/// mean square, or by the prior's standard deviation if that is smaller. A translation comes with the
+/// rotation that keeps the picture in place.
 fn pixels_to_pose(sum: &PoseMatrix, prior: Option<&PosePrior>) -> PoseMatrix {
     // Turns are in radians and moves in world units; the damping compares them as pixels.
     let unit: [f64; POSE] = std::array::from_fn(|i| sum[i][i].sqrt().max(f64::MIN_POSITIVE));

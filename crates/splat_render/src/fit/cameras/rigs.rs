@@ -1,4 +1,4 @@
-//! Rigs: cameras that share one centre and move as one, as the views of a panorama do.
+//! Rigs: cameras that share one center and move as one, as the views of a panorama do.
 //!
 //! All members take the step of the whole, each in its own axes: gradients, measures and priors are
 //! brought to the axes of the rig's first camera, added up, and turned back.
@@ -9,11 +9,9 @@ use super::motion::{POSE, PoseMatrix};
 use crate::camera::Camera;
 use crate::error::{Error, Result};
 
-/// Centres of a rig's cameras are one if they differ by less than this part of how far they are from
-/// the origin, or from each other's scene.
-const ONE_CENTRE: f64 = 1e-5;
+/// Largest distance between a rig's centers, relative to their distances to origin and scene.
+const ONE_CENTER: f64 = 1e-5;
 
-/// Which cameras move as one.
 #[derive(Debug, Clone)]
 pub(super) struct Rigs {
     /// The first camera of each camera's rig.
@@ -23,7 +21,7 @@ pub(super) struct Rigs {
 }
 
 impl Rigs {
-    /// Every camera by itself.
+    /// Every camera is a rig alone.
     pub(super) fn none(count: usize) -> Self {
         Self { first: (0..count).collect(), turn: vec![DMat3::IDENTITY; count] }
     }
@@ -39,8 +37,8 @@ impl Rigs {
             let first = numbers.iter().position(|other| other == number).unwrap_or(k);
             let (from, to) = (&cameras[first], &cameras[k]);
             let apart = from.center().distance(to.center());
-            if apart > ONE_CENTRE * (distances[k] + from.center().length()) {
-                return refused(format!("cameras {first} and {k} do not share a centre"));
+            if apart > ONE_CENTER * (distances[k] + from.center().length()) {
+                return refused(format!("cameras {first} and {k} do not share a center"));
             }
             rigs.first[k] = first;
             rigs.turn[k] = to.rotation() * from.rotation().transpose();
@@ -48,7 +46,6 @@ impl Rigs {
         Ok(rigs)
     }
 
-    /// Whether any camera is of a rig.
     pub(super) fn any(&self) -> bool {
         self.first.iter().enumerate().any(|(k, &first)| first != k)
     }
@@ -80,8 +77,7 @@ impl Rigs {
         }
     }
 
-    /// The sum of each rig's matrices over poses, divided by `1` or by the number of its members, in
-    /// the axes of its first camera; other entries stay as they are.
+    /// Sums (or means) of each rig's matrices in its first camera's axes; other entries are unchanged.
     pub(super) fn sums(&self, matrices: &[PoseMatrix], mean: bool) -> Vec<PoseMatrix> {
         let mut out = matrices.to_vec();
         for first in self.firsts() {
@@ -107,7 +103,7 @@ impl Rigs {
         left_turned(&self.turn[k], &matrices[self.first[k]])
     }
 
-    /// A symmetric one, both sides of which are.
+    /// A symmetric matrix, transformed on both sides.
     pub(super) fn form_at(&self, k: usize, matrices: &[PoseMatrix]) -> PoseMatrix {
         turned(&self.turn[k], &matrices[self.first[k]])
     }

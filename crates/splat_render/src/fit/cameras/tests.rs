@@ -1,4 +1,4 @@
-//! Cameras that are pulled to where points should be seen.
+//! Cameras that are pulled to the positions at which points should appear.
 
 use glam::{DMat3, DMat4, DQuat, DVec3};
 
@@ -42,7 +42,7 @@ fn config() -> CameraConfig {
     }
 }
 
-/// What a standard deviation in pixels along every way of moving leaves of information.
+/// A prior with the same standard deviation in pixels along every direction.
 fn known(camera: &Camera, sigma: f64) -> PosePrior {
     let mut pose = [[0.0; POSE]; POSE];
     for (i, row) in pose.iter_mut().enumerate() {
@@ -62,7 +62,7 @@ const POINTS: [[f64; 3]; 6] = [
     [-0.4, -0.5, -0.6],
 ];
 
-/// Gradient of half the squared distances between where two cameras see the points.
+/// Gradient of half the squared distances between the points in two cameras' pictures.
 fn gradient(view: usize, camera: &Camera, truth: &Camera) -> CameraGradient {
     let mut out = CameraGradient { view, ..CameraGradient::default() };
     for point in POINTS {
@@ -118,7 +118,7 @@ fn cameras_find_the_points_they_should_see() {
     assert!(after < 0.02 * before, "turns were {before:.2e} off and are {after:.2e}");
     for (a, b) in cameras.now().iter().zip(&truth) {
         let off = (a.center() - b.center()).length();
-        assert!(off < 1e-3, "a centre is {off:.2e} off");
+        assert!(off < 1e-3, "a center is {off:.2e} off");
         a.validate().unwrap();
     }
 }
@@ -187,7 +187,7 @@ fn cameras_at_one_place_keep_the_scale_of_their_moves() {
 }
 
 #[test]
-fn cameras_with_priors_stay_within_what_is_known_and_move_along_what_is_not() {
+fn cameras_with_priors_move_along_unknown_directions() {
     let truth = ring(4);
     let off = CameraConfig { anchored: false, focal: Focal::PerCamera, ..config() };
     let mut told = truth.clone();
@@ -229,7 +229,7 @@ fn cameras_with_priors_stay_within_what_is_known_and_move_along_what_is_not() {
 }
 
 #[test]
-fn priors_that_know_nothing_change_no_bit_and_wrong_ones_are_refused() {
+fn empty_priors_change_no_bit_and_wrong_ones_are_refused() {
     let truth = ring(3);
     let mut noisy = truth.clone();
     move_by(&mut noisy[1], [0.01; 6]);
@@ -268,7 +268,7 @@ fn a_state_resumes_and_a_wrong_one_is_refused() {
     assert!(second.resume(broken).is_err());
 }
 
-/// Three cameras at one centre that look up to 0.7 radians apart, for each camera of a ring.
+/// Three cameras at one center that look up to 0.7 radians apart, for each camera of a ring.
 fn rigs(n: usize) -> (Vec<Camera>, Vec<u32>) {
     let turned = |camera: &Camera, angle: f64| {
         let turn = DMat4::from_rotation_y(angle) * DMat4::from_rotation_z(0.5 * angle);
@@ -279,18 +279,18 @@ fn rigs(n: usize) -> (Vec<Camera>, Vec<u32>) {
     (views.collect(), (0..n as u32).flat_map(|k| [k; 3]).collect())
 }
 
-/// Largest change of a turn between cameras of a rig, and of the distance between their centres.
+/// Largest change of a turn between cameras of a rig, and of the distance between their centers.
 fn bend(a: &[Camera], b: &[Camera], numbers: &[u32]) -> (f64, f64) {
-    let (mut turns, mut centres) = (0.0_f64, 0.0_f64);
+    let (mut turns, mut centers) = (0.0_f64, 0.0_f64);
     for k in 1..a.len() {
         if numbers[k] == numbers[k - 1] {
             let within = |c: &[Camera]| c[k].rotation() * c[k - 1].rotation().transpose();
             let off = within(a) - within(b);
             turns = turns.max(off.to_cols_array().map(f64::abs).into_iter().fold(0.0, f64::max));
-            centres = centres.max(a[k].center().distance(a[k - 1].center()));
+            centers = centers.max(a[k].center().distance(a[k - 1].center()));
         }
     }
-    (turns, centres)
+    (turns, centers)
 }
 
 #[test]
@@ -313,8 +313,8 @@ fn rigs_find_the_points_and_keep_their_shape() {
     fitted(&mut cameras, &truth, 1000);
     let after = worst_angle(cameras.now(), &truth);
     assert!(after < 0.02 * before, "turns were {before:.2e} off and are {after:.2e}");
-    let (turns, centres) = bend(cameras.now(), &truth, &numbers);
-    assert!(turns < 1e-9 && centres < 1e-9, "a rig bent by {turns:.1e} and {centres:.1e}");
+    let (turns, centers) = bend(cameras.now(), &truth, &numbers);
+    assert!(turns < 1e-9 && centers < 1e-9, "a rig bent by {turns:.1e} and {centers:.1e}");
 
     // Without rigs, noisy gradients pull its cameras apart.
     let mut free = Cameras::new(&noisy, vec![4.0; 12], off);
@@ -323,7 +323,7 @@ fn rigs_find_the_points_and_keep_their_shape() {
 }
 
 #[test]
-fn a_prior_of_one_camera_holds_its_rig() {
+fn a_prior_of_one_camera_keeps_its_rig_in_place() {
     let (told, numbers) = rigs(3);
     let pushed: Vec<_> = told
         .iter()
@@ -347,14 +347,14 @@ fn a_prior_of_one_camera_holds_its_rig() {
     fitted(&mut cameras, &pushed, 100);
     let moved = worst_angle(cameras.now(), &told);
     assert!(moved < 0.002, "known rigs turned by {moved:.2e}");
-    let (turns, centres) = bend(cameras.now(), &told, &numbers);
-    assert!(turns < 1e-9 && centres < 1e-9);
+    let (turns, centers) = bend(cameras.now(), &told, &numbers);
+    assert!(turns < 1e-9 && centers < 1e-9);
 }
 
 #[test]
 fn rigs_of_cameras_that_stand_apart_are_refused() {
     let mut cameras = Cameras::new(&ring(3), vec![4.0; 3], config());
     assert!(cameras.set_rigs(&[0, 1]).unwrap_err().to_string().contains("one number for each"));
-    assert!(cameras.set_rigs(&[0, 1, 0]).unwrap_err().to_string().contains("share a centre"));
+    assert!(cameras.set_rigs(&[0, 1, 0]).unwrap_err().to_string().contains("share a center"));
     cameras.set_rigs(&[0, 1, 2]).unwrap();
 }

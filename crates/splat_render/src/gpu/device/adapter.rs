@@ -9,7 +9,7 @@ use std::task::{Context, Poll, Waker};
 use super::limits::check_limits;
 use super::{GROUPS_MAX, Gpu, Injected, list_limit, note, one_line};
 use crate::error::{Error, Result};
-use crate::gpu::shaders::{Access, Build, Kernel, SOURCES, Source};
+use crate::gpu::kernels::{Build, Kernel};
 
 /// Futures of wgpu's native backends are ready at once or after `poll`.
 fn ready<T>(future: impl Future<Output = T>) -> T {
@@ -23,7 +23,6 @@ fn ready<T>(future: impl Future<Output = T>) -> T {
     }
 }
 
-/// Real GPUs first.
 fn rank(kind: wgpu::DeviceType) -> u32 {
     match kind {
         wgpu::DeviceType::DiscreteGpu => 0,
@@ -56,12 +55,8 @@ fn adapters(instance: &wgpu::Instance) -> Vec<wgpu::Adapter> {
 }
 
 impl Gpu {
-    /// Opens the best adapter: a real GPU where there is one, else, if `software_allowed`, a
-    /// software one such as lavapipe. Kernels compile when they are first used;
-    /// `gpu_check` compiles and tries them.
-    ///
-    /// # Errors
-    /// [`Error::NoAdapter`] if none answers, [`Error::Device`] if the one that does fails.
+    /// Opens the best adapter: a real GPU if there is one, else, if `software_allowed`, a software
+    /// adapter such as lavapipe. Kernels compile when they are first used.
     pub fn new(software_allowed: bool) -> Result<Self> {
         Self::with_faults(software_allowed, &Injected::default())
     }
@@ -79,11 +74,11 @@ impl Gpu {
         let Some(adapter) = adapters.first() else {
             return Err(Error::NoAdapter(
                 if software_only {
-                    "backend gpu: only a software adapter answers; ask for it by name or use \
-                     backend cpu, which is faster"
+                    "backend gpu: only a software adapter was found; choose backend gpu to use \
+                     it, or backend cpu, which is faster"
                 } else {
-                    "backend gpu: no Vulkan, Metal or DX12 adapter answers; install a driver \
-                     (mesa-vulkan-drivers has one for machines without a GPU) or use backend cpu"
+                    "backend gpu: no Vulkan, Metal or DX12 adapter was found; install a driver \
+                     (mesa-vulkan-drivers includes one for machines without a GPU) or use backend cpu"
                 }
                 .to_owned(),
             ));
@@ -91,14 +86,13 @@ impl Gpu {
         Self::open(adapter, injected)
     }
 
-    /// Opens the best adapter that can show pictures in a window, a software one where there is no
-    /// other, and the window's surface on it.
+    /// Opens the best adapter that can draw in a window, and the window's surface.
     pub fn for_window(
         window: impl Into<wgpu::SurfaceTarget<'static>>,
     ) -> Result<(Self, wgpu::Adapter, wgpu::Surface<'static>)> {
         let instance = instance();
         let mut adapters = adapters(&instance);
-        // Without a driver there is no surface either, and wgpu's error for that names nothing.
+        // Without a driver there is no surface, and wgpu's error does not name the cause.
         if !adapters.is_empty() {
             let surface = instance
                 .create_surface(window)
@@ -110,7 +104,7 @@ impl Gpu {
         }
         Err(Error::Device(
             "no Vulkan, Metal or DX12 adapter can draw in a window here; install a driver \
-             (mesa-vulkan-drivers has one for machines without a GPU)"
+             (mesa-vulkan-drivers includes one for machines without a GPU)"
                 .to_owned(),
         ))
     }
@@ -124,7 +118,7 @@ impl Gpu {
         check_limits(&info.name, &offered)?;
         let software = info.device_type == wgpu::DeviceType::Cpu;
         let [real, sharing, plain] = Build::ALL;
-        // Subgroups only where they were measured to pay.
+        // Use subgroups only on adapters for which they were measured to be faster.
         let threads = sharing.threads();
         let shares = adapter.features().contains(wgpu::Features::SUBGROUP)
             && (info.subgroup_min_size, info.subgroup_max_size) == (threads, threads);
@@ -133,8 +127,7 @@ impl Gpu {
             (true, true) => sharing,
             (true, false) => plain,
         };
-        // What the kernels do not need may be lower than WebGPU's defaults. Scenes profit from large
-        // buffers.
+        // Accept limits below WebGPU's defaults if the kernels do not need them; request large buffers.
         let required_limits = wgpu::Limits {
             max_storage_buffer_binding_size: offered.max_storage_buffer_binding_size,
             max_buffer_size: offered.max_buffer_size,
@@ -145,7 +138,7 @@ impl Gpu {
         let (device, queue) = ready(adapter.request_device(&wgpu::DeviceDescriptor {
             label: Some("splat_render"),
             required_limits,
-            // Who draws frames wants to know what they cost.
+            // For callers that time frames.
             required_features: adapter.features() & wgpu::Features::TIMESTAMP_QUERY
                 | if build.subgroups { wgpu::Features::SUBGROUP } else { wgpu::Features::empty() },
             memory_hints: wgpu::MemoryHints::Performance,
@@ -153,7 +146,7 @@ impl Gpu {
         }))
         .map_err(|e| {
             Error::Device(format!(
-                "backend gpu: {} does not open ({}); update its driver or use backend cpu",
+                "backend gpu: {} cannot be opened ({}); update its driver or use backend cpu",
                 info.name,
                 one_line(&e.to_string())
             ))
@@ -174,18 +167,16 @@ impl Gpu {
         device.set_device_lost_callback(move |_, message| {
             let _ = is_lost.set(one_line(&message));
         });
-        let layouts = SOURCES.iter().map(|source| bind_group_layout(&device, source)).collect();
         let gpu = Self {
             device,
             queue,
             info,
             pipelines: Kernel::ALL.iter().map(|_| OnceLock::new()).collect(),
-            layouts,
             failure,
             lost,
             injected: injected.clone(),
             submissions_left: AtomicU64::new(0),
-            planned: None,
+            plans_only: false,
             made: Default::default(),
             host_bytes: AtomicU64::new(0),
             binding_limit,
@@ -196,30 +187,4 @@ impl Gpu {
         gpu.check()?;
         Ok(gpu)
     }
-}
-
-fn bind_group_layout(device: &wgpu::Device, source: &Source) -> wgpu::BindGroupLayout {
-    let entries: Vec<_> = source
-        .bindings
-        .iter()
-        .enumerate()
-        .map(|(i, access)| wgpu::BindGroupLayoutEntry {
-            binding: i as u32,
-            visibility: wgpu::ShaderStages::COMPUTE,
-            ty: wgpu::BindingType::Buffer {
-                ty: match access {
-                    Access::Uniform => wgpu::BufferBindingType::Uniform,
-                    Access::Read => wgpu::BufferBindingType::Storage { read_only: true },
-                    Access::Write => wgpu::BufferBindingType::Storage { read_only: false },
-                },
-                has_dynamic_offset: false,
-                min_binding_size: None,
-            },
-            count: None,
-        })
-        .collect();
-    device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor {
-        label: Some(source.name),
-        entries: &entries,
-    })
 }

@@ -6,8 +6,8 @@ use super::commands::Op;
 use super::{Gpu, note};
 use crate::error::Result;
 
-/// What new buffers hold in builds with debug assertions: 1.5e9 as a float, far out as an index. A
-/// NaN would not show in gradients, which are set to zero where they are not finite.
+/// Contents of new buffers in builds with debug assertions: 1.5e9 as a float, out of range as an index. A
+/// NaN would not show in gradients, which are set to zero if not finite.
 #[cfg(debug_assertions)]
 const POISON: u32 = 0x4ead_beef;
 
@@ -18,15 +18,15 @@ impl Gpu {
     /// A buffer of at least `bytes`, with nothing of use in it.
     pub(in crate::gpu) fn buffer(&self, label: &str, bytes: u64) -> Result<wgpu::Buffer> {
         let size = bytes.max(BUFFER_MIN).next_multiple_of(4);
-        if self.planned.is_none() && size > self.device.limits().max_buffer_size {
-            return Err(self.error(&format!("holds no buffer of {size} bytes for {label}")));
+        if !self.plans_only && size > self.device.limits().max_buffer_size {
+            return Err(
+                self.error(&format!("has no room for a buffer of {size} bytes for {label}"))
+            );
         }
         if self.injected.buffer_bytes.is_some_and(|most| size > most) {
             return Err(self.error("is out of memory"));
         }
-        if let Some(planned) = &self.planned {
-            return Ok(planned.buffer(&self.device, size));
-        }
+        let size = if self.plans_only { BUFFER_MIN } else { size };
         let buffer = self.device.create_buffer(&wgpu::BufferDescriptor {
             label: Some(label),
             size,
@@ -37,7 +37,7 @@ impl Gpu {
             mapped_at_creation: cfg!(debug_assertions),
         });
         self.count(size);
-        // wgpu hands out zeros, which would hide a read of what no kernel has written.
+        // wgpu clears buffers, which would hide reads of memory that no kernel has written.
         #[cfg(debug_assertions)]
         {
             if let Ok(mut view) = buffer.get_mapped_range_mut(..) {
@@ -50,36 +50,27 @@ impl Gpu {
         Ok(buffer)
     }
 
-    /// Size of a buffer, that it would have where it is only planned.
-    pub(in crate::gpu) fn size_of(&self, buffer: &wgpu::Buffer) -> u64 {
-        self.planned.as_ref().and_then(|planned| planned.size(buffer)).unwrap_or(buffer.size())
-    }
-
-    /// Checks that a buffer can be bound whole.
     pub(in crate::gpu) fn bindable_bytes(&self, label: &str, bytes: u64) -> Result<()> {
         if bytes > self.binding_limit {
             return Err(self.error(&format!(
-                "binds at most {} bytes at once where {label} needs {bytes}",
+                "binds at most {} bytes at once, but {label} needs {bytes}",
                 self.binding_limit
             )));
         }
         Ok(())
     }
 
-    /// A buffer that must be bound whole.
     pub(in crate::gpu) fn bindable(&self, label: &str, bytes: u64) -> Result<wgpu::Buffer> {
         self.bindable_bytes(label, bytes)?;
         self.buffer(label, bytes)
     }
 
-    /// Room for what a pixel keeps between dispatches that walk a part of its tile's list each;
-    /// empty where one walks all.
+    /// Per-pixel state between dispatches that each walk a part of a tile's list; empty if one walks all.
     pub(in crate::gpu) fn transmittances(&self, pixels: u64) -> Result<wgpu::Buffer> {
         let floats = if self.list_limit == u32::MAX { 0 } else { pixels };
         self.bindable("transmittances", 4 * floats)
     }
 
-    /// A buffer with the given contents.
     pub(in crate::gpu) fn upload<T: bytemuck::NoUninit>(
         &self,
         label: &str,
@@ -94,15 +85,13 @@ impl Gpu {
         Ok(buffer)
     }
 
-    /// Overwrites a part of a buffer.
     pub(in crate::gpu) fn write(&self, buffer: &wgpu::Buffer, offset: u64, bytes: &[u8]) {
         self.count_host(bytes.len() as u64);
-        if self.planned.is_none() {
+        if !self.plans_only {
             self.queue.write_buffer(buffer, offset, bytes);
         }
     }
 
-    /// A uniform buffer with the given contents.
     pub(in crate::gpu) fn uniform<T: bytemuck::NoUninit>(&self, contents: &T) -> wgpu::Buffer {
         let size = size_of::<T>().next_multiple_of(16) as u64;
         self.count(size);
@@ -163,7 +152,7 @@ impl Gpu {
             let failure = Arc::clone(&self.failure);
             buffer.slice(..).map_async(wgpu::MapMode::Read, move |result| {
                 if let Err(error) = result {
-                    note(&failure, format!("gave no results back ({error})"));
+                    note(&failure, format!("returned no results ({error})"));
                 }
             });
         }
@@ -176,7 +165,7 @@ impl Gpu {
             self.count_host(bytes);
             let view = buffer
                 .get_mapped_range(..)
-                .map_err(|e| self.error(&format!("gave no results back ({e})")))?;
+                .map_err(|e| self.error(&format!("returned no results ({e})")))?;
             out.push(view[..bytes as usize].to_vec());
             drop(view);
             buffer.unmap();

@@ -2,16 +2,14 @@
 
 use std::num::NonZeroU64;
 use std::ops::Range;
-use std::sync::Arc;
 
 use rayon::prelude::*;
 
-use super::Gpu;
+use super::{Gpu, Pipeline};
 use crate::error::Result;
+use crate::gpu::kernels::{Access, Kernel, Source};
 use crate::gpu::layout::SPLATS_PER_GROUP;
-use crate::gpu::shaders::{Kernel, SOURCES, Source};
 
-/// A binding of a kernel.
 #[derive(Debug, Clone)]
 pub(in crate::gpu) struct Bound<'a> {
     buffer: &'a wgpu::Buffer,
@@ -29,17 +27,11 @@ impl<'a> Bound<'a> {
     pub fn part(buffer: &'a wgpu::Buffer, bytes: Range<u64>) -> Self {
         Self { buffer, bytes: Some(bytes) }
     }
-
-    /// Bytes that are bound.
-    fn size(&self, gpu: &Gpu) -> u64 {
-        self.bytes.as_ref().map_or_else(|| gpu.size_of(self.buffer), |b| b.end - b.start)
-    }
 }
 
-/// How many workgroups a dispatch has.
 #[derive(Debug, Clone)]
 pub(in crate::gpu) enum Groups {
-    /// So many, known when it is prepared.
+    /// Known when the dispatch is prepared.
     Direct([u32; 2]),
     /// As three numbers at an offset in a buffer say, bytes.
     Indirect(wgpu::Buffer, u64),
@@ -51,43 +43,38 @@ impl From<[u32; 2]> for Groups {
     }
 }
 
-/// One prepared command.
 #[derive(Debug, Clone)]
 pub(in crate::gpu) enum Op {
-    /// Runs a kernel.
     Dispatch {
         kernel: Kernel,
-        /// Bytes of each binding, in the order of their numbers.
-        bound: Arc<[u64]>,
-        /// None where work is only planned.
+        /// None if work is only planned.
         run: Option<(wgpu::ComputePipeline, wgpu::BindGroup)>,
         groups: Groups,
     },
-    /// Fills a buffer with zeros.
     Clear(wgpu::Buffer),
-    /// Copies so many bytes (the last) from the start of the first buffer to an offset in the second.
+    /// Copies bytes (last field) from the start of the first buffer to an offset in the second.
     Copy(wgpu::Buffer, wgpu::Buffer, u64, u64),
 }
 
 impl Gpu {
-    fn pipeline(&self, kernel: Kernel) -> &wgpu::ComputePipeline {
+    fn pipeline(&self, kernel: Kernel) -> &Pipeline {
         self.pipelines[kernel as usize].get_or_init(|| {
-            let (file, entry) = kernel.entry();
-            let source = Source::named(file);
+            let (source, entry) = (kernel.source(), kernel.entry());
             self.count(0);
             let module = self.device.create_shader_module(wgpu::ShaderModuleDescriptor {
-                label: Some(file),
+                label: Some(source.name),
                 source: wgpu::ShaderSource::Wgsl(
                     self.injected.text(source.text(self.build)).into(),
                 ),
             });
+            let bindings = bind_group_layout(&self.device, source);
             let layout = self.device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
-                label: Some(file),
-                bind_group_layouts: &[Some(self.layout(file))],
+                label: Some(source.name),
+                bind_group_layouts: &[Some(&bindings)],
                 immediate_size: 0,
             });
             let constants = source.constants(self.build);
-            self.device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+            let pipeline = self.device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
                 label: Some(entry),
                 layout: Some(&layout),
                 module: &module,
@@ -97,24 +84,17 @@ impl Gpu {
                     ..Default::default()
                 },
                 cache: None,
-            })
+            });
+            (pipeline, bindings)
         })
     }
 
     /// Compiles every kernel, several at once.
-    ///
-    /// # Errors
-    /// [`crate::Error::Device`] with what the driver says of the first that it refuses.
     pub fn compile_all(&self) -> Result<()> {
         Kernel::ALL.par_iter().for_each(|&kernel| {
             self.pipeline(kernel);
         });
         self.check()
-    }
-
-    fn layout(&self, file: &str) -> &wgpu::BindGroupLayout {
-        let index = SOURCES.iter().position(|source| source.name == file).unwrap_or(0);
-        &self.layouts[index]
     }
 
     /// Prepares a kernel on its bindings, in the order of their numbers.
@@ -125,9 +105,8 @@ impl Gpu {
         groups: impl Into<Groups>,
     ) -> Op {
         let groups = groups.into();
-        let bound = bindings.iter().map(|bound| bound.size(self)).collect();
-        if self.planned.is_some() {
-            return Op::Dispatch { kernel, bound, run: None, groups };
+        if self.plans_only {
+            return Op::Dispatch { kernel, run: None, groups };
         }
         let entries: Vec<_> = bindings
             .iter()
@@ -141,14 +120,14 @@ impl Gpu {
                 }),
             })
             .collect();
-        let pipeline = self.pipeline(kernel).clone();
+        let (pipeline, layout) = self.pipeline(kernel);
         self.count(0);
         let bind_group = self.device.create_bind_group(&wgpu::BindGroupDescriptor {
-            label: Some(kernel.entry().1),
-            layout: self.layout(kernel.entry().0),
+            label: Some(kernel.entry()),
+            layout,
             entries: &entries,
         });
-        Op::Dispatch { kernel, bound, run: Some((pipeline, bind_group)), groups }
+        Op::Dispatch { kernel, run: Some((pipeline.clone(), bind_group)), groups }
     }
 
     /// Workgroups for `count` invocations or tiles, spilling into y past the limit of x.
@@ -158,15 +137,13 @@ impl Gpu {
         [x, groups.div_ceil(x)]
     }
 
-    /// Splats `begin..end` of each dispatch, so that `bytes_per_splat` times their number can be
-    /// bound at once.
+    /// Ranges of splats so small that `bytes_per_splat` times their number can be bound at once.
     pub(in crate::gpu) fn windows(&self, splats: u32, bytes_per_splat: u64) -> Vec<Range<u32>> {
         let fit = (self.binding_limit / bytes_per_splat).min(u64::from(u32::MAX / 2)) as u32;
         let step = (fit / SPLATS_PER_GROUP).max(1) * SPLATS_PER_GROUP;
         (0..splats).step_by(step as usize).map(|b| b..(b + step).min(splats)).collect()
     }
 
-    /// Records prepared commands in order.
     pub(in crate::gpu) fn record(encoder: &mut wgpu::CommandEncoder, ops: &[Op]) {
         let mut rest = ops;
         while let Some(first) = rest.first() {
@@ -219,4 +196,30 @@ impl Gpu {
         self.queue.submit([encoder.finish()]);
         self.check()
     }
+}
+
+fn bind_group_layout(device: &wgpu::Device, source: &Source) -> wgpu::BindGroupLayout {
+    let entries: Vec<_> = source
+        .bindings
+        .iter()
+        .enumerate()
+        .map(|(i, access)| wgpu::BindGroupLayoutEntry {
+            binding: i as u32,
+            visibility: wgpu::ShaderStages::COMPUTE,
+            ty: wgpu::BindingType::Buffer {
+                ty: match access {
+                    Access::Uniform => wgpu::BufferBindingType::Uniform,
+                    Access::Read => wgpu::BufferBindingType::Storage { read_only: true },
+                    Access::Write => wgpu::BufferBindingType::Storage { read_only: false },
+                },
+                has_dynamic_offset: false,
+                min_binding_size: None,
+            },
+            count: None,
+        })
+        .collect();
+    device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor {
+        label: Some(source.name),
+        entries: &entries,
+    })
 }

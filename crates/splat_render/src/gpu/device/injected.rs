@@ -1,4 +1,4 @@
-//! What tests make an adapter do: none that fails is at hand.
+//! Faults for tests, since no failing adapter is at hand.
 
 use super::limits::needed_limits;
 
@@ -11,7 +11,7 @@ pub struct Injected {
     pub bad_shader: bool,
     /// Kernels compute wrong values.
     pub wrong_values: bool,
-    /// Limits that the adapter has in place of its own, where they are lower.
+    /// Limits of the adapter, used if lower than its real ones.
     pub limits: Option<wgpu::Limits>,
     /// Larger buffers are more than the memory holds.
     pub buffer_bytes: Option<u64>,
@@ -24,7 +24,7 @@ impl Injected {
         Self { limits: Some(limits), ..self }
     }
 
-    /// Whether results are those of a sound device.
+    /// Whether results are correct.
     pub fn is_sound(&self) -> bool {
         !self.bad_shader && !self.wrong_values
     }
@@ -35,7 +35,7 @@ impl Injected {
             return text + "\nfn no_driver_takes_this(";
         }
         if self.wrong_values {
-            // The cap of alpha, far from where it is.
+            // Wrong values: a much lower cap on alpha.
             return text.replace("const ALPHA_MAX = ", "const ALPHA_MAX = 0.5 * ");
         }
         text

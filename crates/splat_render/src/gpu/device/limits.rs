@@ -1,9 +1,8 @@
-//! What an adapter must have, and the message for one that has not.
+//! Required limits of an adapter, and the error message for too low ones.
 
 use crate::error::{Error, Result};
 
-/// What the kernels ask of an adapter; a test holds it against them. All of it is within WebGPU's
-/// default limits.
+/// Limits that the kernels need, all within WebGPU's defaults. A test compares them with the kernels.
 pub fn needed_limits() -> wgpu::Limits {
     wgpu::Limits {
         max_storage_buffers_per_shader_stage: 8,
@@ -20,11 +19,10 @@ pub fn needed_limits() -> wgpu::Limits {
     }
 }
 
-/// Checks that an adapter can run the kernels.
 pub(super) fn check_limits(name: &str, offered: &wgpu::Limits) -> Result<()> {
     let mut short = Vec::new();
     needed_limits().check_limits_with_fail_fn(offered, false, |limit, needed, has| {
-        short.push(format!("{limit} is {has} where igsr needs {needed}"));
+        short.push(format!("{limit} is {has}, but igsr needs {needed}"));
     });
     if short.is_empty() {
         return Ok(());

@@ -1,12 +1,11 @@
-//! The device: what is known of it, and wgpu's errors as this crate's. It is opened in `adapter.rs`,
-//! makes buffers in `buffers.rs` and runs kernels in `commands.rs`.
+//! The device and its errors. `adapter.rs` opens it, `buffers.rs` makes buffers, and `commands.rs` runs
+//! kernels.
 
 mod adapter;
 mod buffers;
 mod commands;
 mod injected;
 mod limits;
-mod planned;
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
@@ -15,8 +14,11 @@ pub(super) use commands::{Bound, Groups, Op};
 pub use injected::Injected;
 pub use limits::needed_limits;
 
-use super::shaders::{Build, Kernel};
+use super::kernels::{Build, Kernel};
 use crate::error::{Error, Result};
+
+/// A compiled kernel and the layout of its bindings.
+type Pipeline = (wgpu::ComputePipeline, wgpu::BindGroupLayout);
 
 /// wgpu on one adapter, with this crate's kernels.
 #[derive(Debug)]
@@ -24,27 +26,24 @@ pub struct Gpu {
     pub(super) device: wgpu::Device,
     pub(super) queue: wgpu::Queue,
     info: wgpu::AdapterInfo,
-    pipelines: Vec<OnceLock<wgpu::ComputePipeline>>,
-    layouts: Vec<wgpu::BindGroupLayout>,
+    /// Kernels that were used, in the order of their numbers.
+    pipelines: Vec<OnceLock<Pipeline>>,
     /// First error that wgpu reported since the last check.
     failure: Arc<Mutex<Option<String>>>,
     /// Why the device was lost, after which nothing works on it.
     lost: Arc<OnceLock<String>>,
-    /// What tests make it do.
     injected: Injected,
-    /// Submissions until one fails, that one included; 0 where none will.
+    /// Number of submissions until one fails, including it; 0 if none will.
     submissions_left: AtomicU64,
-    /// Where work is planned and not done.
-    planned: Option<planned::Planned>,
+    /// Whether work is only planned: buffers take no memory and nothing runs.
+    plans_only: bool,
     /// Buffers, bind groups and pipelines made so far, and the buffers' bytes.
     made: [AtomicU64; 2],
-    /// Bytes that went between host and device so far.
     host_bytes: AtomicU64,
     /// Most bytes that a storage binding may have.
     pub(super) binding_limit: u64,
     /// Most workgroups in one dimension of a dispatch.
     pub(super) groups_max: u32,
-    /// What the shaders are built for.
     build: Build,
     /// Pairs of a tile that one dispatch of the rasterize kernels walks.
     pub(super) list_limit: u32,
@@ -82,8 +81,7 @@ impl Gpu {
         self
     }
 
-    /// Keeps tiles from sharing through subgroups, which not every device can, so that tests see
-    /// both ways.
+    /// Disables subgroups, so that tests cover both ways.
     #[must_use]
     pub fn without_subgroups(mut self) -> Self {
         self.build.subgroups = false;
@@ -108,21 +106,18 @@ impl Gpu {
         self.list_limit = list_limit(false, false);
         self.binding_limit = binding_limit;
         self.groups_max = GROUPS_MAX;
-        self.planned = Some(planned::Planned::default());
+        self.plans_only = true;
         self
     }
 
-    /// Workgroups that scans and sorts are cut into.
     pub(super) fn segments(&self) -> u32 {
         self.build.segments
     }
 
-    /// Bits that one pass of the radix sort takes.
     pub(super) fn digit_bits(&self) -> u32 {
         self.build.digit_bits
     }
 
-    /// Whether the loss goes along whole rows and columns.
     pub(super) fn loss_by_lines(&self) -> bool {
         self.build.loss_by_lines
     }
@@ -132,7 +127,7 @@ impl Gpu {
         format!("{} ({:?}, {})", self.info.name, self.info.backend, self.info.driver_info)
     }
 
-    /// What wgpu knows of the adapter and its driver.
+    /// The adapter and its driver, as wgpu reports them.
     pub fn info(&self) -> &wgpu::AdapterInfo {
         &self.info
     }
@@ -167,14 +162,14 @@ impl Gpu {
         self.lost.get().is_some()
     }
 
-    /// Loses the device as a driver that is reset does, for tests of what becomes of its callers.
+    /// Loses the device as a driver reset does, for tests.
     pub fn lose(&self) {
         self.device.destroy();
         // The callback is called from here, once nothing is under way.
         let _ = self.device.poll(wgpu::PollType::wait_indefinitely());
     }
 
-    /// Lets a submission fail, once: the next one at 1. For tests of what becomes of its callers.
+    /// Makes one submission fail, the next one at 1, for tests.
     pub fn fail_submission(&self, number: u64) {
         self.submissions_left.store(number, Ordering::Relaxed);
     }
@@ -216,14 +211,13 @@ impl Gpu {
         self.made[1].fetch_add(bytes, Ordering::Relaxed);
     }
 
-    /// The error for a device that fails while running.
     fn error(&self, what: &str) -> Error {
         let name = &self.info.name;
         Error::Device(match self.lost.get() {
             Some(why) => format!(
-                "backend gpu: {name} was lost ({why}): its driver was reset, updated or found a step \
-                 too long; the next call opens it again; if it is lost again, use smaller images or \
-                 backend cpu"
+                "backend gpu: {name} was lost ({why}): its driver was reset or updated, or a step \
+                 took too long; the next call opens it again; if it is lost again, use smaller \
+                 images or backend cpu"
             ),
             None => format!(
                 "backend gpu: {name} {what}; use fewer splats or smaller images, or backend cpu"
@@ -231,7 +225,7 @@ impl Gpu {
         })
     }
 
-    /// What wgpu reported since the last call; always an error once the device is lost.
+    /// The first error since the last call; always an error once the device is lost.
     pub fn check(&self) -> Result<()> {
         let failure = self.failure.lock().ok().and_then(|mut f| f.take());
         if self.is_lost() {
@@ -248,7 +242,7 @@ fn one_line(text: &str) -> String {
 
 fn note(failure: &Mutex<Option<String>>, what: String) {
     if let Ok(mut failure) = failure.lock() {
-        // The first failure is the cause, what follows its consequences.
+        // Later failures are consequences of the first.
         failure.get_or_insert_with(|| one_line(&what));
     }
 }

@@ -1,4 +1,4 @@
-//! What a fit keeps on the device for pictures of one size, and the commands of a step.
+//! A fit's buffers for pictures of one size, and the commands of a step.
 
 use std::ops::Range;
 
@@ -27,7 +27,7 @@ pub(super) struct Frame {
     pub exposure: Option<ExposureBuffers>,
     /// Made for the first step whose photo has a depth.
     pub depth: Option<DepthBuffers>,
-    /// Tiles of each chunk; more than one only where the pairs of all do not fit one binding.
+    /// Tiles of each chunk; more than one chunk only if the pairs of all tiles do not fit one binding.
     pub chunks: Vec<Range<u32>>,
     /// Empty until needed, and again whenever a buffer was replaced.
     pub ops: Vec<Op>,
@@ -46,7 +46,7 @@ pub(super) struct Uniforms<'a> {
     pub color_steps: &'a wgpu::Buffer,
 }
 
-/// The uniforms of what only some steps have.
+/// Uniforms of optional parts of a step.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Parts<'a> {
     /// An `ExposureUniform`.
@@ -72,7 +72,7 @@ impl Frame {
         })
     }
 
-    /// Brings a photo to where the loss reads it.
+    /// Copies a photo to the loss's input buffer.
     pub fn copy_photo(&self, rgba: &wgpu::Buffer) -> Op {
         let bytes = u64::from(self.width) * u64::from(self.height) * 4;
         Op::Copy(rgba.clone(), self.loss.photo.clone(), 0, bytes)

@@ -1,20 +1,20 @@
-//! The GPU as a fitting device: parameters, Adam's moments, photos and everything between stay in
-//! its memory; a step is one submission of prepared commands.
+//! Fitting on the GPU: parameters, Adam's moments, photos and all intermediate data stay in its memory; a
+//! step is one submission of prepared commands.
 //!
-//! Buffers for (splat, tile) pairs have a capacity. A step that needs more finds out on the device
-//! and leaves the state as it was, as do the steps after it; the host looks at that flag now and
-//! then, makes room and repeats those steps, so that no step waits for a read-back.
+//! Buffers for (splat, tile) pairs have a capacity. A step that needs more detects it on the device and
+//! leaves the state unchanged, as do the steps after it. The host polls that flag from time to time,
+//! enlarges the buffers and repeats those steps, so that no step waits for a read-back.
 //!
-//! Colours of splats that a step does not see wait ([`crate::fit_device::COLOR_WAIT`]).
+//! Colors of splats that a step does not see wait ([`crate::fit_device::COLOR_WAIT`]).
 //!
-//! Memory. Per splat with K SH coefficients, the parameters are P = 4 (11 + 3 K) bytes: P and two moments
-//! make 3 P; statistics, the gradient of a colour, 2D splats, their gradients and the depth order take
-//! 144. A (splat, tile) pair has 60 bytes, 40 of them its gradient slot; there is room for 4 per
-//! splat at first, later for a quarter more than any step has needed. A pixel has 84 bytes, 36 of them
-//! slopes of SSIM (96 and 48 on software adapters), 16 more where exposures are fitted and
-//! 8 more where photos have depths; a photo 4 per pixel, 4 more for weights and 8 more for depths. A
-//! test holds the sum per splat. While density control runs, splats and moments are there twice, and 60 to
-//! 70 bytes per splat for what it draws.
+//! Memory. Per splat with K SH coefficients, the parameters take P = 4 (11 + 3 K) bytes: P and two
+//! moments make 3 P; statistics, the gradient of a color, 2D splats, their gradients and the depth order
+//! take 144. A (splat, tile) pair takes 60 bytes, 40 of them its gradient slot; the initial capacity is 4
+//! pairs per splat, later a quarter more than any step has needed. A pixel takes 84 bytes, 36 of them
+//! slopes of SSIM (96 and 48 on software adapters), 16 more if exposures are fitted and 8 more if photos
+//! have depths; a photo 4 per pixel, 4 more for weights and 8 more for depths. A test checks the sum per
+//! splat. Density control temporarily needs a second copy of splats and moments, and 60 to 70 bytes per
+//! splat for its draws.
 
 mod frame;
 mod plan;
@@ -42,7 +42,7 @@ use crate::sh;
 use crate::stages::ProjectOptions;
 use crate::target::{Target, Weight};
 use frame::{Frame, Parts, Uniforms};
-pub use plan::{PlannedFit, StepWork};
+pub use plan::PlannedFit;
 use scene::{Scene, pair_buffers};
 
 /// Steps that may be under way before the host looks whether all pairs fitted.
@@ -64,11 +64,11 @@ pub struct GpuFit {
     scene: Option<Scene>,
     /// MCMC's table of shares; None until density control runs.
     shares: Option<wgpu::Buffer>,
-    /// Steps not known to have been done, with the number of those that colours waited for before.
+    /// Submitted, unconfirmed steps, each with the number of steps that colors waited for before it.
     pending: Vec<(StepInput, usize)>,
     /// While pending steps are done again: the last of them that was submitted again.
     redone: Option<usize>,
-    /// The steps that colours may wait for, those that are pending included.
+    /// The steps that colors may wait for, pending ones included.
     waiting: WaitingSteps,
     camera_gradients: Vec<CameraGradient>,
     exposure_gradients: Vec<ExposureGradient>,
@@ -78,7 +78,6 @@ pub struct GpuFit {
     last: Option<(usize, f32, bool)>,
 }
 
-/// A photo on the device.
 #[derive(Debug)]
 struct Photo {
     frame: usize,
@@ -88,11 +87,10 @@ struct Photo {
     depth: Option<PhotoDepth>,
 }
 
-/// A photo's depths on the device.
 #[derive(Debug)]
 struct PhotoDepth {
     rows: wgpu::Buffer,
-    /// What one counts, times the step's weight.
+    /// Weight of one depth in the loss, before the step's `depth_weight`.
     scale: f64,
 }
 
@@ -121,9 +119,8 @@ impl GpuFit {
         }
     }
 
-    /// Colours of splats that are not seen wait for at most so many steps, by default
-    /// [`COLOR_WAIT`](crate::fit::COLOR_WAIT); with 1, all are brought up to date in every step. Bits are
-    /// the same.
+    /// Limits the steps that colors of unseen splats wait, by default to
+    /// [`COLOR_WAIT`](crate::fit::COLOR_WAIT). The bits do not change.
     pub fn with_color_wait(self, steps: usize) -> Self {
         Self { waiting: WaitingSteps::at_most(steps), ..self }
     }
@@ -134,7 +131,7 @@ impl GpuFit {
             .ok_or_else(|| Error::argument("splats", "have not been uploaded to the device"))
     }
 
-    /// Brings all colours up to date; all steps must be done.
+    /// Brings all colors up to date; all steps must be done.
     fn catch_up(&mut self) -> Result<()> {
         if self.waiting.get().is_empty() {
             return Ok(());
@@ -151,8 +148,8 @@ impl GpuFit {
         Ok(())
     }
 
-    /// Submits one step without waiting for it, as number `at` of those pending; colours wait for
-    /// `waiting` steps before it. `again` where its pairs did not fit before.
+    /// Submits one step without waiting for it, as number `at` of the pending steps; colors wait for
+    /// `waiting` steps before it. `again` if its pairs did not fit before.
     fn enqueue(&mut self, input: &StepInput, at: usize, waiting: usize, again: bool) -> Result<()> {
         let scene = self
             .scene
@@ -313,7 +310,7 @@ impl GpuFit {
         };
         let settled = self.redo(&pending, first);
         if let Err(error) = settled.and_then(|()| self.read_sums(&pending)) {
-            // Whoever asks for the state gets this error again, and none without these steps.
+            // The next read of the state reports this error again.
             self.pending = pending;
             return Err(error);
         }
@@ -322,7 +319,7 @@ impl GpuFit {
 
     /// Does the pending steps again from `first` on, whose pairs did not fit, with room for them.
     fn redo(&mut self, pending: &[(StepInput, usize)], first: usize) -> Result<()> {
-        // One at a time, so that the counts read are those of the step that needs the room.
+        // One at a time, so that the counts read belong to the step that needs the room.
         for (at, (input, waiting)) in pending.iter().enumerate().skip(first) {
             loop {
                 if let Err(error) = self.enqueue(input, at, *waiting, true) {
@@ -376,7 +373,7 @@ impl GpuFit {
                 return Err(Error::argument(
                     "splats",
                     format!(
-                        "{} lie in one 16x16 tile, the device takes {limit}; lower max_splats or \
+                        "{} are in one 16x16 tile, but the device takes {limit}; lower max_splats or \
                          use backend cpu",
                         count.total
                     ),
@@ -389,7 +386,7 @@ impl GpuFit {
             .as_mut()
             .ok_or_else(|| Error::argument("splats", "have not been uploaded to the device"))?;
         if need > scene.capacity {
-            // The capacity is that of the buffers there are, also where there is no memory for more.
+            // If allocation fails, the old buffers and their capacity stay.
             let capacity = need.saturating_add(need / 4).min(limit);
             (scene.pairs, scene.slots) = pair_buffers(&gpu, capacity, tiles)?;
             scene.capacity = capacity;
@@ -456,7 +453,7 @@ impl FitDevice for GpuFit {
         self.pending.clear();
         self.redone = None;
         self.waiting.clear();
-        // What the last scene has grown to is likely to be needed again.
+        // Keep the capacity of the last scene, which is likely to be needed again.
         let (capacity, chunks) = self.scene.take().map_or((0, 1), |s| (s.capacity, s.chunks));
         for frame in &mut self.frames {
             frame.ops.clear();

@@ -1,4 +1,4 @@
-//! What a fit keeps on the device that depends on the number of splats or pairs.
+//! A fit's buffers whose size depends on the number of splats or pairs.
 
 use crate::error::Result;
 use crate::fit_device::{FitState, McmcRun, OriginalRun};
@@ -11,7 +11,7 @@ use crate::gpu::project::{Projection, SPLAT_2D, count};
 use crate::gpu::project_backward::{camera_buffer, camera_sums};
 use crate::gpu::{mcmc, original};
 
-/// Pairs per splat that buffers have room for at first; they grow by what a step needs.
+/// Initial capacity, pairs per splat; grows on demand.
 const PAIRS_PER_SPLAT: u32 = 4;
 
 /// Buffers that depend on the number of splats or pairs.
@@ -21,19 +21,18 @@ pub(super) struct Scene {
     pub sh_degree: u32,
     pub splats2d: wgpu::Buffer,
     pub v_splats2d: wgpu::Buffer,
-    /// Sums of the camera's gradients.
     pub v_camera: wgpu::Buffer,
     /// The camera sums of each pending step; None until a step is to have them.
     pub pending_cameras: Option<wgpu::Buffer>,
     pub bins: SplatBins,
-    /// What the host reads of `bins.status`.
+    /// Copy of `bins.status` for the host.
     pub status_copy: wgpu::Buffer,
     /// Chunks that `bins` has counts for.
     pub chunks: u32,
     pub pairs: PairBins,
     pub slots: wgpu::Buffer,
     pub capacity: u32,
-    /// What brings all colours up to date. Empty until needed, and again whenever a buffer was replaced.
+    /// Commands that bring all colors up to date. Empty until needed, and whenever a buffer was replaced.
     pub catch_up: Vec<Op>,
 }
 
@@ -65,7 +64,6 @@ impl Scene {
         Self::new(gpu, adam, state.splats.sh_degree, tiles, capacity, chunks)
     }
 
-    /// Around these splats.
     pub fn new(
         gpu: &Gpu,
         adam: AdamBuffers,
@@ -96,14 +94,13 @@ impl Scene {
         })
     }
 
-    /// Whether the device does density control that leaves so many splats.
+    /// Whether density control with a result of `splats` splats runs on the device.
     fn binds(&self, gpu: &Gpu, splats: u32) -> bool {
         let floats = self.adam.splats.color_floats.max(GEOMETRY as u64);
         self.adam.moving == self.len() && u64::from(splats) * 4 * floats <= gpu.binding_limit
     }
 
-    /// What a run of MCMC's density control makes of it; None where an array cannot be bound at once,
-    /// or some splats are only drawn.
+    /// The scene after MCMC's density control; None if an array exceeds a binding or splats are frozen.
     pub fn after_mcmc(
         &self,
         gpu: &Gpu,
@@ -120,7 +117,7 @@ impl Scene {
         self.after(gpu, &drawn, tiles).map(Some)
     }
 
-    /// What a run of the original density control makes of it; None as above.
+    /// The scene after a run of the original density control; None as in [`Self::after_mcmc`].
     pub fn after_original(&self, gpu: &Gpu, run: &OriginalRun, tiles: u32) -> Result<Option<Self>> {
         if !self.binds(gpu, self.len()) {
             return Ok(None);
@@ -136,12 +133,11 @@ impl Scene {
         Ok(next)
     }
 
-    /// Another scene of the splats that a density control has drawn, and the commands that fill it;
-    /// statistics begin anew.
+    /// A new scene after density control, and the commands that fill it; statistics are reset.
     pub fn arranged(&self, gpu: &Gpu, drawn: &Drawn, tiles: u32) -> Result<(Self, Vec<Op>)> {
         let AdamBuffers { splats, first, second, .. } = &self.adam;
         let floats = [GEOMETRY as u32, splats.color_floats as u32];
-        // What is there stays until all that follows has its memory.
+        // The old buffers stay until all new ones are allocated.
         let adam = AdamBuffers::new(gpu, drawn.splats, splats.color_floats)?;
         let next = Self::new(gpu, adam, self.sh_degree, tiles, self.capacity, self.chunks)?;
         let mut ops = drawn.order_ops(gpu, &next.bins);
@@ -159,7 +155,7 @@ impl Scene {
         Ok((next, ops))
     }
 
-    /// Makes the commands that bring all colours up to date, unless they are there already.
+    /// Makes the commands that bring all colors up to date, unless they are there already.
     pub fn prepare(&mut self, gpu: &Gpu, view: &wgpu::Buffer, color_steps: &wgpu::Buffer) {
         if self.catch_up.is_empty() {
             let drawn = Projection { view, splats2d: &self.splats2d };
@@ -167,17 +163,15 @@ impl Scene {
         }
     }
 
-    /// Number of splats.
     pub fn len(&self) -> u32 {
         self.adam.splats.splats
     }
 
-    /// Size of one step's camera sums.
     pub fn camera_bytes(&self) -> u64 {
         u64::from(camera_sums(self.len())) * CAMERA as u64 * 4
     }
 
-    /// The state as it is now; all steps must be done, and all colours up to date.
+    /// The state as it is now; all steps must be done, and all colors up to date.
     pub fn download(&self, gpu: &Gpu) -> Result<FitState> {
         let ([splats, first, second], stats) = self.adam.download(gpu, &[], self.sh_degree)?;
         Ok(FitState {

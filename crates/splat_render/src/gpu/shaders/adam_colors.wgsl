@@ -1,4 +1,4 @@
-// adam_colors: one optimiser step of all colours by gradients of their own; in fits colours wait
+// adam_colors: one optimizer step of all colors by gradients of their own; in fits colors wait
 // (waiting_colors.wgsl). Follows adam_update.wgsl.
 
 @group(0) @binding(0) var<uniform> view: View;

@@ -1,4 +1,4 @@
-// One optimiser step of a splat's mean, scales, quaternion and opacity, and the exploration noise.
+// One optimizer step of a splat's mean, scales, quaternion and opacity, and the exploration noise.
 // Follows adam_update.wgsl.
 
 // In (0, 1].

@@ -1,4 +1,4 @@
-// adam_geometry: the optimiser step of means, scales, quaternions and opacities by itself; fits have
+// adam_geometry: a separate optimizer step of means, scales, quaternions and opacities; fits use
 // fit_geometry. Follows adam_geometry.wgsl.
 
 @group(0) @binding(0) var<uniform> step: Step;

@@ -1,5 +1,4 @@
-// Adam's step of one number with its first and second moments: what all three become. Follows
-// shared.wgsl.
+// Adam's step of one number: its new value, first and second moments. Follows shared.wgsl.
 
 fn adam_step(state: vec3<f32>, g: f32, rate: f32, bias: vec2<f32>) -> vec3<f32> {
     let m = ADAM_BETA1 * state.y + (1.0 - ADAM_BETA1) * g;

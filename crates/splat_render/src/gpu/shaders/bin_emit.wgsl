@@ -34,8 +34,8 @@ fn emit(
         let span = chunk_columns(f, row);
         let row_begin = row * view.tiles_x - chunk.tile_begin;
         for (var column = span.x; column < span.y; column++) {
-            // Two kernels may round the same expression apart; what would overrun lies in the
-            // margin and contributes nothing.
+            // Two kernels may round the same expression differently; pairs that would overrun lie in the
+            // margin and contribute nothing.
             if slot < end {
                 keys[slot] = row_begin + column;
                 slots[slot] = slot;

@@ -1,5 +1,5 @@
-// bin_ranges: where each tile's pairs begin in the sorted list, and the splat of each pair.
-// Follows shared.wgsl.
+// bin_ranges: the start of each tile's pairs in the sorted list, and the splat of each pair. Follows
+// shared.wgsl.
 
 @group(0) @binding(0) var<uniform> chunk: Chunk;
 @group(0) @binding(1) var<storage, read> status: Status;
@@ -7,7 +7,7 @@
 @group(0) @binding(3) var<storage, read> slot_from_pair: array<u32>;
 @group(0) @binding(4) var<storage, read> splat_from_slot: array<u32>;
 @group(0) @binding(5) var<storage, read_write> splat_from_pair: array<u32>;
-// Tiles of the chunk + 2; the last is the number of pairs, some of which may be behind all tiles.
+// Tiles of the chunk + 2; the last is the number of pairs, including those after all tiles.
 @group(0) @binding(6) var<storage, read_write> tile_begin: array<u32>;
 
 @compute @workgroup_size(64)

@@ -27,7 +27,7 @@ fn own_range(segment: u32, local: u32) -> vec2<u32> {
     return vec2(begin, min(begin + per_thread, status.visible));
 }
 
-// Workgroups for so many splats; they spill into y past the limit of x.
+// Workgroups for `splats` splats; they spill into y past the limit of x.
 fn groups_of(splats: u32) -> vec3<u32> {
     let groups = max((splats + 63u) / 64u, 1u);
     let x = min(groups, chunk.groups_max);

@@ -1,5 +1,5 @@
-// What is sorted: the splats by depth, culled ones left out in the first pass or kept, or the pairs of a
-// chunk. Follows shared.wgsl.
+// Input of the sort: the splats by depth (culled ones are dropped in the first pass or kept), or the
+// pairs of a chunk. Follows shared.wgsl.
 
 struct SortPass {
     // Lowest bit of the digit.
@@ -8,7 +8,7 @@ struct SortPass {
     chunk: u32,
     // 1 in the first pass over the splats, whose values are their indices.
     is_first: u32,
-    // 1 where culled splats stay, as the last.
+    // 1 if culled splats stay, at the end.
     keeps_culled: u32,
 }
 
@@ -19,7 +19,7 @@ const ALL_SPLATS = 0xffffffffu;
 
 var<workgroup> key_count: u32;
 
-// The number of keys. Each thread of a workgroup has the same, which a compiler cannot tell otherwise.
+// The number of keys. Same for all threads of a workgroup, which a compiler cannot prove otherwise.
 fn same_for_all(local: u32) -> u32 {
     if local == 0u {
         if pass_.chunk != ALL_SPLATS {

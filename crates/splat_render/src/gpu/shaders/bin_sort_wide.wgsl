@@ -1,8 +1,7 @@
-// bin_sort: one pass of a stable radix sort by eight bits, in two dispatches. Every workgroup owns a
-// contiguous segment. The first counts digits; the second adds up what lies before, which takes each
-// workgroup a read of the whole histogram, and scatters 256 keys at a time: a thread's place among those
-// of its digit is the number of bits before its own in the digit's mask. No workgroup waits for another,
-// and the result depends on nothing but the keys. Follows shared.wgsl and bin_sort_keys.wgsl.
+// bin_sort: one pass of a stable radix sort by eight bits, in two dispatches over contiguous segments.
+// The first counts digits; the second sums the counts of earlier segments and scatters 256 keys at a
+// time: a thread's place within its digit is the number of lower bits in the digit's mask. No workgroup
+// waits for another, and the result depends only on the keys. Follows shared.wgsl and bin_sort_keys.wgsl.
 
 @group(0) @binding(2) var<storage, read> keys_in: array<u32>;
 @group(0) @binding(3) var<storage, read> values_in: array<u32>;

@@ -9,7 +9,7 @@ struct Footprint {
     shear: f32,
     p: f32,
     r: f32,
-    // Where the ellipse is rightmost.
+    // Height of the ellipse's rightmost point.
     w_right: f32,
     row_begin: u32,
     row_end: u32,
@@ -44,7 +44,7 @@ fn footprint(splat: Splat2d) -> Footprint {
     return f;
 }
 
-// First and one-past-last tile column of a row of tiles; empty where begin >= end.
+// First and one-past-last tile column of a row of tiles; empty if begin >= end.
 fn columns(f: Footprint, row: u32) -> vec2<u32> {
     let band_begin = row * TILE;
     let band_end = min(band_begin + TILE, view.height);

@@ -40,7 +40,7 @@ fn bits_or(low: vec3<f32>, high: vec3<f32>, k: u32) -> f32 {
     return out;
 }
 
-// The box of the finite centres, a part for each workgroup.
+// The box of the finite centers, a part for each workgroup.
 @compute @workgroup_size(THREADS)
 fn density_bounds(
     @builtin(workgroup_id) workgroup: vec3<u32>,
@@ -71,7 +71,7 @@ fn density_bounds(
 }
 
 fn cell(point: f32, low: f32, scale: f32) -> u32 {
-    // `upper` is 0 or 1, so that what is given to rounded is 0.
+    // `upper` is 0 or 1, so the second argument of rounded is 0.
     let place = rounded(point - low, cells.upper >> 1u) * scale;
     if !is_finite(place) {
         return 0u;

@@ -3,7 +3,7 @@
 struct Rows {
     splats: u32,
     floats: u32,
-    // 0: rows as they lie. 1: colours, from where `rows` says. 2: moments, from there or zero.
+    // 0: rows in order. 1: colors, gathered by `rows`. 2: moments, gathered or zero.
     kind: u32,
     unused: u32,
 }

@@ -1,21 +1,21 @@
-// depth_loss: relative difference of a picture's depth and a photo's; adds its gradients to those of
-// the picture. Each thread adds up pixels that lie a stride apart, a workgroup its threads in order,
-// the host the groups. Follows shared.wgsl.
+// depth_loss: relative difference of a picture's depth and a photo's; adds its gradients to the
+// picture's. Each thread sums pixels at a stride, a workgroup its threads in order, the host the groups.
+// Follows shared.wgsl.
 
 struct DepthStep {
-    // What a pixel of confidence 1 counts in the loss.
+    // Weight of a pixel of confidence 1 in the loss.
     scale: f32,
 }
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> step: DepthStep;
-// Colours (xyz) and transmittance (w).
+// Colors (xyz) and transmittance (w).
 @group(0) @binding(2) var<storage, read> picture: array<vec4<f32>>;
 // Accumulated depths.
 @group(0) @binding(3) var<storage, read> depths: array<f32>;
-// The photo's depth and its confidence, 0 where it is not known.
+// The photo's depth and its confidence, 0 if unknown.
 @group(0) @binding(4) var<storage, read> photo: array<vec2<f32>>;
-// Gradients of colour (xyz) and accumulated depth (w).
+// Gradients of color (xyz) and accumulated depth (w).
 @group(0) @binding(5) var<storage, read_write> v_picture: array<vec4<f32>>;
 // As rasterize_backward reads them.
 @group(0) @binding(6) var<storage, read_write> totals: array<f32>;

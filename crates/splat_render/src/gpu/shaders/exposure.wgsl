@@ -1,24 +1,22 @@
-// exposure and exposure_backward: a picture's colours as a photo of some gain and offset has them,
-// and back from the gradients of those colours to the picture's. Sums of gain and offset: each
-// thread adds up pixels that lie a stride apart, a workgroup its threads in order, the host the groups.
-// Follows shared.wgsl.
+// exposure and exposure_backward: a photo's gain and offset. Each thread sums pixels at a stride, a
+// workgroup its threads in order, the host the groups. Follows shared.wgsl.
 
-// Fourth components are unused but for that of background: 1 where a photo with alpha keeps it.
+// Fourth components are unused except background's: 1 if the photo has alpha and keeps its background.
 struct Exposure {
     gain: vec4<f32>,
     offset: vec4<f32>,
-    // How a colour grows with the transmittance.
+    // How a color grows with the transmittance.
     behind: vec4<f32>,
     background: vec4<f32>,
 }
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> exposed: Exposure;
-// Colours (xyz) and transmittance (w).
+// Colors (xyz) and transmittance (w).
 @group(0) @binding(2) var<storage, read> picture: array<vec4<f32>>;
-// Colours a photo has (xyz) and, from backward, the gradient of alpha (w).
+// Colors a photo has (xyz) and, from backward, the gradient of alpha (w).
 @group(0) @binding(3) var<storage, read_write> corrected: array<vec4<f32>>;
-// Gradients: of the corrected colours before, of the picture's after.
+// Gradients: of the corrected colors before, of the picture's after.
 @group(0) @binding(4) var<storage, read_write> v_picture: array<vec4<f32>>;
 // As rasterize_backward reads them.
 @group(0) @binding(5) var<storage, read_write> totals: array<f32>;
@@ -30,7 +28,7 @@ const SUMS = 6u;
 
 var<workgroup> partial_sums: array<f32, 384>; // SUMS THREADS
 
-// A pixel before it is cut to what a photo holds.
+// A corrected pixel before the clamp.
 fn raw(pixel: vec4<f32>) -> vec3<f32> {
     return exposed.gain.xyz * pixel.xyz + exposed.offset.xyz + pixel.w * exposed.behind.xyz;
 }
@@ -59,13 +57,13 @@ fn exposure_backward(
         let pixel = picture[i];
         let before = raw(pixel);
         let gradient = v_picture[i].xyz;
-        // What takes a cut colour further away from what a photo holds stays behind.
-        // Brackets, or "<" and ">" of one expression open and close a template list.
+        // Gradients that would move a clamped color further out are dropped. Brackets, because "<" and
+        // ">" in one expression open and close a template list.
         let over = (before > vec3(1.0)) & (gradient < vec3(0.0));
         let under = (before < vec3(0.0)) & (gradient > vec3(0.0));
         let leaves = over | under;
         let v = select(gradient, vec3(0.0), leaves);
-        // What of the pixel the exposure leaves as it is.
+        // The part of the pixel that the exposure does not change.
         let kept = pixel.w * exposed.background.w;
         v_gain += v * (pixel.xyz - kept * exposed.background.xyz);
         v_offset += v * (1.0 - kept);

@@ -1,10 +1,10 @@
-// fit_geometry: project_backward, adam of means, scales, quaternions and opacities, and what density
-// control watches in one, so that no gradient is stored but that of a colour, which waits
-// (waiting_colors.wgsl). Only splats that are not culled have any. Runs no workgroup once a chunk's pairs
-// did not fit. Follows splat_backward.wgsl and adam_geometry.wgsl.
+// fit_geometry: project_backward, adam of means, scales, quaternions and opacities, and density
+// statistics in one kernel. It stores no gradient except the color's, which waits (waiting_colors.wgsl).
+// Culled splats have no gradient. Runs no workgroup if a chunk's pairs did not fit. Follows
+// splat_backward.wgsl and adam_geometry.wgsl.
 
 @group(0) @binding(4) var<storage, read> splats2d: array<Splat2d>;
-// GRADIENT floats per splat: mean 2, factor 3, depth, colour 3, opacity.
+// GRADIENT floats per splat: mean 2, factor 3, depth, color 3, opacity.
 @group(0) @binding(5) var<storage, read> v_splats2d: array<f32>;
 // NOTES words per splat.
 @group(0) @binding(6) var<storage, read_write> notes: array<u32>;
@@ -14,14 +14,14 @@
 @group(0) @binding(9) var<storage, read_write> second: array<f32>;
 @group(0) @binding(10) var<uniform> step: Step;
 
-// Gradients of coefficients follow from that of the colour.
+// Gradients of coefficients follow from the color's.
 fn keep_coefficient(row: u32, v: vec3<f32>) {}
 
 fn add_to_note(at: u32, value: f32) {
     notes[at] = bitcast<u32>(bitcast<f32>(notes[at]) + value);
 }
 
-// The step's gradient of a colour, for when the splat is next seen.
+// The step's gradient of a color, for when the splat is next seen.
 fn keep_color(i: u32, v: Backward) {
     let note = i * NOTES;
     notes[note + NOTE_WAITS] |= 1u;

@@ -1,11 +1,12 @@
-// What both directions of the project stage need of one splat, and its spherical harmonics. Declared
-// before are `geometry`, GEOMETRY floats per splat: mean 3, scales 3, quaternion 4 (wxyz), opacity 1; and
-// `colors`, 3 floats per coefficient, `sh_stride` coefficients per splat (1 for direct colours).
+// Shared by both directions of the project stage: one splat's geometry and its spherical harmonics.
+// Declared before are `geometry`, GEOMETRY floats per splat: mean 3, scales 3, quaternion 4 (wxyz),
+// opacity 1; and `colors`, 3 floats per coefficient, `sh_stride` coefficients per splat (1 for direct
+// colors).
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> window: Window;
 
-// How colours and parameters are stored, as `look_up_mode` has it from the view.
+// How colors and parameters are stored, as `look_up_mode` has it from the view.
 struct Mode {
     sh_degree: u32,
     sh_stride: u32,
@@ -15,8 +16,8 @@ struct Mode {
 
 var<private> mode: Mode;
 
-// Mesa's lavapipe compiles a kernel anew at every dispatch, and frees nothing, where branches on
-// uniforms alone may leave much of it out. So these depend on the workgroup, too: it changes none.
+// Mesa's lavapipe recompiles a kernel at every dispatch, and leaks, if branches that depend only on
+// uniforms may skip much of it. Adding the workgroup's id avoids that without changing a value.
 fn look_up_mode(workgroup: vec3<u32>) {
     let most = SH_COEFFS_MAX + workgroup.x;
     mode.sh_degree = min(view.sh_degree, most);
@@ -27,11 +28,11 @@ fn look_up_mode(workgroup: vec3<u32>) {
 
 struct Geometry {
     visible: bool,
-    // Camera-space centre.
+    // Camera-space center.
     t: vec3<f32>,
     // Columns: the splat's axes in the world.
     axes: mat3x3<f32>,
-    quat: vec4<f32>, // wxyz, normalised
+    quat: vec4<f32>, // wxyz, normalized
     quat_norm: f32,
     scales: vec3<f32>,
     opacity: f32,
@@ -102,7 +103,7 @@ fn load_geometry(local: u32) -> Geometry {
     let scaled = quat / largest;
     let scaled_norm = sqrt(dot(scaled, scaled));
     g.quat_norm = largest * scaled_norm;
-    // The square of the norm is what the limit is stated for; it cannot overflow here.
+    // The limit is defined for the squared norm; it cannot overflow here.
     if g.quat_norm < 1.0 && g.quat_norm * g.quat_norm < QUAT_NORM2_MIN {
         return g;
     }
@@ -164,7 +165,7 @@ fn root_dets(g: Geometry) -> vec2<f32> {
     return largest * vec2(length(area / largest), length(vec4(area, rest) / largest));
 }
 
-// R^T t is the vector from the camera's centre to the mean, without the cancellation of
+// R^T t is the vector from the camera's center to the mean, without the cancellation of
 // subtracting two far-away points. Length in w.
 fn view_direction(t: vec3<f32>) -> vec4<f32> {
     let largest = max(max(abs(t.x), abs(t.y)), abs(t.z));
@@ -172,9 +173,9 @@ fn view_direction(t: vec3<f32>) -> vec4<f32> {
     return vec4(to_world(t / length), length);
 }
 
-// A basis function at a direction (x, y, z) and its derivatives by x, y and z taken as independent.
-// Same order and signs as sh.rs. A degree at a time and not by number: a switch in a loop is what
-// DX12's older compiler is worst at, and a thread needs all of a degree anyway.
+// A basis function at a direction (x, y, z) and its derivatives by x, y and z taken as independent. Same
+// order and signs as sh.rs. Evaluated a degree at a time: DX12's older compiler is worst at a switch in a
+// loop, and a thread needs all of a degree anyway.
 struct Term {
     value: f32,
     derivative: vec3<f32>,
@@ -294,7 +295,7 @@ fn sh_degree_four(d: vec3<f32>) -> array<Term, 9> {
     );
 }
 
-// SH colour before the cut at zero.
+// SH color before the cut at zero.
 fn sh_color(local: u32, direction: vec3<f32>) -> vec3<f32> {
     let row = local * mode.sh_stride;
     var color = SH_C0 * coefficient(row);

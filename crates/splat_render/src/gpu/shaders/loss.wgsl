@@ -1,14 +1,12 @@
-// loss: L1 and D-SSIM of the picture against a photo, with the picture's gradient. Two passes with
-// the window's filter, which is separable: first to the slopes of SSIM by the filtered maps, then
-// back through the same filter. A thread filters four neighbours at once, so that each value is read
-// once for the four. The first pass hands on
-// derivatives of the weighted SSIM sum by the filtered x, xx and xy: nine planes, by channel first.
-// Follows loss_pixels.wgsl.
+// loss: L1 and D-SSIM of the picture against a photo, with the picture's gradient. Two passes of a
+// separable filter: to the slopes of SSIM by the filtered maps, then back. A thread filters four
+// neighbors at once. The first pass writes derivatives of the weighted SSIM sum by the filtered x, xx and
+// xy: nine planes, by channel first. Follows loss_pixels.wgsl.
 
 const THREADS = 64u;
-// Taps on each side of the window's centre.
+// Taps on each side of the window's center.
 const HALF = 5;
-// Values that four neighbouring outputs need.
+// Values that four neighboring outputs need.
 const SPAN = 14u;
 // Rows of a tile with the window's margin.
 const ROWS_FILTERED = 26u;

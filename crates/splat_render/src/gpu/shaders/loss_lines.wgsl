@@ -1,10 +1,10 @@
-// loss on software adapters, where a load from any memory is dear and a barrier dearer: a thread goes
-// down a whole column, or along a whole row, and keeps the window's eleven values in registers. First
-// down the columns of the picture, then along the rows of what that filtered: to the slopes of SSIM and
-// at once through the filter again, then down the columns of that. Follows loss_pixels.wgsl.
+// loss on software adapters, which pay much for a memory load and more for a barrier: a thread processes
+// a whole column or row and keeps the window's eleven values in registers. The passes are: down the
+// columns of the picture; along the rows of the result, to the slopes of SSIM and at once through the
+// filter again; down the columns of that. Follows loss_pixels.wgsl.
 
 const THREADS = 8u;
-// Taps on each side of the window's centre.
+// Taps on each side of the window's center.
 const HALF = 5u;
 // Floats of a pixel between passes: filtered x, y, xx + yy and xy; then derivatives of the weighted SSIM
 // sum by the filtered x, xx and xy.

@@ -1,4 +1,4 @@
-// What the loss reads and writes, and a photo's pixels. Follows shared.wgsl.
+// Bindings of the loss, and a photo's pixels. Follows shared.wgsl.
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> step: Step;
@@ -6,7 +6,7 @@
 // RGBA, 8 bits each, straight alpha.
 @group(0) @binding(3) var<storage, read> photo: array<u32>;
 @group(0) @binding(4) var<storage, read> weights: array<f32>;
-// What goes from pass to pass.
+// Data between passes.
 @group(0) @binding(5) var<storage, read_write> slopes: array<f32>;
 @group(0) @binding(6) var<storage, read_write> v_picture: array<vec4<f32>>;
 @group(0) @binding(7) var<storage, read_write> totals: array<f32>;

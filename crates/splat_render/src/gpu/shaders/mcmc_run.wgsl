@@ -1,14 +1,14 @@
-// What a run of MCMC's density control is told. Follows shared.wgsl.
+// Uniforms of a run of MCMC's density control. Follows shared.wgsl.
 
 struct Run {
-    // Splats before, and what is to be added to them.
+    // Splats before the run; the next field is the number to add.
     splats: u32,
     fresh: u32,
     seed: u32,
     // 0: dead splats move. 1: the number grows.
     round: u32,
     cameras: u32,
-    // Every so many splats are sampled.
+    // Stride of the sample.
     every: u32,
     color_floats: u32,
     // Always 0, for rounded.

@@ -1,7 +1,7 @@
-// MCMC's density control, second part: dead splats, and fresh ones behind the others, become copies of
-// splats that are drawn by weight, and all copies share opacity and size. Colours and moments stay where
-// they are until all are put in order; `rows` keeps where they come from. As fit_device/mcmc.rs, bit for
-// bit. Follows shared.wgsl and mcmc_run.wgsl.
+// MCMC's density control, second part: dead splats, and added ones at the end, become copies of splats
+// drawn by weight, and all copies share opacity and size. Colors and moments move only in the final sort;
+// `rows` keeps their sources. Matches fit_device/mcmc.rs bit for bit. Follows shared.wgsl and
+// mcmc_run.wgsl.
 
 @group(0) @binding(1) var<storage, read_write> geometry: array<f32>;
 @group(0) @binding(2) var<storage, read> weight_sums: array<u32>;
@@ -10,12 +10,12 @@
 @group(0) @binding(4) var<storage, read> totals: array<vec2<u32>, 2>;
 @group(0) @binding(5) var<storage, read_write> copies: array<atomic<u32>>;
 @group(0) @binding(6) var<storage, read_write> sources: array<u32>;
-// Twice the row of a splat's colours, and 1 where its moments are to be zero.
+// Twice the row of a splat's colors, plus 1 if its moments become zero.
 @group(0) @binding(7) var<storage, read_write> rows: array<u32>;
-// What is added to logit and log scales, by the bin of the logit and the number of shares from 2 on.
+// Changes of logit and log scales, by the bin of the logit and the number of shares from 2 on.
 @group(0) @binding(8) var<storage, read> shares: array<vec2<f32>>;
 
-// Splats that are to become copies; none where there is nothing to copy.
+// Number of splats that become copies; 0 if there is nothing to copy.
 fn target_count() -> u32 {
     if totals[run.round].x == 0u {
         return 0u;

@@ -1,13 +1,13 @@
-// MCMC's density control, first part: what is fog or dead, and what the others weigh.
-// As fit_device/mcmc.rs and fit_device/fog.rs, bit for bit. Follows shared.wgsl and mcmc_run.wgsl.
+// MCMC's density control, first part: finds fog and dead splats and weighs the rest. Matches
+// fit_device/mcmc.rs and fit_device/fog.rs bit for bit. Follows shared.wgsl and mcmc_run.wgsl.
 
 @group(0) @binding(1) var<storage, read_write> geometry: array<f32>;
 // SH coefficients, 3 floats each.
 @group(0) @binding(2) var<storage, read> colors: array<f32>;
 @group(0) @binding(3) var<storage, read> cameras: array<FogCamera>;
-// What a living splat weighs, by the bin of its logit.
+// Weight of a living splat, by the bin of its logit.
 @group(0) @binding(4) var<storage, read> table: array<u32>;
-// Weights, 0 of the dead. In `sample`, centres of the sampled splats.
+// Weights, 0 of the dead. In `sample`, centers of the sampled splats.
 @group(0) @binding(5) var<storage, read_write> words: array<u32>;
 
 struct FogCamera {
@@ -19,7 +19,7 @@ struct FogCamera {
     unused: f32,
 }
 
-// Centres of every `run.every` splats.
+// Centers of every `run.every` splats.
 @compute @workgroup_size(64)
 fn mcmc_sample(
     @builtin(workgroup_id) workgroup: vec3<u32>,
@@ -107,7 +107,7 @@ fn mcmc_weigh(
     for (var k = 0u; k < GEOMETRY; k++) {
         finite = finite && is_finite(geometry[at + k]);
     }
-    // What is not finite dies anyway.
+    // Splats that are not finite die anyway.
     if run.round == 0u && finite {
         if is_fog(at) {
             geometry[at + 10u] = LOGIT_FOG;

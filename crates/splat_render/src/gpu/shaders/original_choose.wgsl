@@ -4,12 +4,12 @@
 @group(0) @binding(2) var<storage, read> colors: array<f32>;
 // NOTES words per splat.
 @group(0) @binding(3) var<storage, read> notes: array<f32>;
-// Keys of a sort of those that want to grow, hardest pulled first; then 0 of those that stay.
+// Sort keys of the splats that want to grow, hardest pulled first; later 0 for splats that stay.
 @group(0) @binding(4) var<storage, read_write> keys: array<u32>;
 @group(0) @binding(5) var<storage, read> order: array<u32>;
 @group(0) @binding(6) var<storage, read> status: Status;
-@group(0) @binding(7) var<storage, read_write> told: array<u32>;
-// 0 of those that stay and grow.
+@group(0) @binding(7) var<storage, read_write> flags: array<u32>;
+// 0 for splats that stay and grow.
 @group(0) @binding(8) var<storage, read_write> growing: array<u32>;
 
 fn largest_scale(at: u32) -> f32 {
@@ -50,11 +50,11 @@ fn original_pull(
         let pulled = pull(notes[i * NOTES + NOTE_PULL], notes[i * NOTES + NOTE_SEEN]);
         key = select(CULLED_KEY, ~pulled, pulled > PULL_GROW);
     }
-    told[i] = bits;
+    flags[i] = bits;
     keys[i] = key;
 }
 
-// The first of those that want to grow, as many as there is room for.
+// The first splats that want to grow, as far as room permits.
 @compute @workgroup_size(64)
 fn original_grow(
     @builtin(workgroup_id) workgroup: vec3<u32>,
@@ -63,7 +63,7 @@ fn original_grow(
 ) {
     let rank = linear_index(workgroup, groups, local, 64u);
     if rank < min(status.visible, run.room) {
-        told[order[rank]] |= GROWS;
+        flags[order[rank]] |= GROWS;
     }
 }
 
@@ -77,7 +77,7 @@ fn original_keep(
     if i >= run.splats {
         return;
     }
-    let bits = told[i];
+    let bits = flags[i];
     var largest = largest_scale(i * GEOMETRY);
     if (bits & (GROWS | LARGE)) == (GROWS | LARGE) {
         largest -= LOG_SPLIT_SHRINK;

@@ -1,14 +1,14 @@
-// The original density control, second part: those that stay, and behind them what is added, clones and
-// halves of splits. As fit_device/original.rs, bit for bit. Follows shared.wgsl and original_run.wgsl.
+// The original density control, second part: the splats that stay, followed by clones and halves of
+// splits. Matches fit_device/original.rs bit for bit. Follows shared.wgsl and original_run.wgsl.
 
-@group(0) @binding(2) var<storage, read> told: array<u32>;
-// Splats that stay, and those of them that grow.
+@group(0) @binding(2) var<storage, read> flags: array<u32>;
+// Indices of splats that stay; the next binding lists the growing ones among them.
 @group(0) @binding(3) var<storage, read> staying: array<u32>;
 @group(0) @binding(4) var<storage, read> growing: array<u32>;
 // The numbers of both, each behind a sum.
 @group(0) @binding(5) var<storage, read> totals: array<vec2<u32>, 2>;
 @group(0) @binding(6) var<storage, read_write> drawn: array<f32>;
-// Twice the row of a splat's colours and moments, and 1 where its moments are to be zero.
+// Twice the row of a splat's colors and moments, plus 1 if its moments become zero.
 @group(0) @binding(7) var<storage, read_write> rows: array<u32>;
 
 // A normal draw: the sum of twelve uniform ones, less its mean.
@@ -29,7 +29,7 @@ fn exp_whole(x: f32) -> f32 {
     return bitcast<f32>((u32((power >> 16u) + 127) << 23u) | ((fraction - bend) << 7u));
 }
 
-// What one operation made, or 0 where that is tiny: some drivers flush such numbers, so none may keep them.
+// The result of one operation, or 0 if it is tiny: some drivers flush such numbers, so all must.
 fn kept(x: f32) -> f32 {
     let bits = bitcast<u32>(rounded(x, run.zero));
     return bitcast<f32>(select(bits, 0u, (bits & 0x7fffffffu) < KEPT_BITS_MIN));
@@ -56,7 +56,7 @@ fn two_over(x: f32) -> f32 {
     return kept(bitcast<f32>(bitcast<u32>(inverse) + 0x40000000u - (bits & 0x7f800000u)));
 }
 
-// Where one of the halves of a splat comes to lie.
+// Position of one of the halves of a splat.
 fn half_mean(at: u32, base: u32) -> vec3<f32> {
     let mean = vec3(geometry[at], geometry[at + 1u], geometry[at + 2u]);
     let w = kept(geometry[at + 6u]);
@@ -121,7 +121,7 @@ fn original_draw(
     for (var c = 0u; c < GEOMETRY; c++) {
         drawn[to + c] = geometry[at + c];
     }
-    let splits = (told[i] & (GROWS | LARGE)) == (GROWS | LARGE);
+    let splits = (flags[i] & (GROWS | LARGE)) == (GROWS | LARGE);
     if splits {
         let mean = half_mean(at, hash(i ^ hash(run.seed ^ u32(is_fresh))));
         drawn[to] = mean.x;

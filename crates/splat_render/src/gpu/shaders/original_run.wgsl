@@ -1,4 +1,4 @@
-// What a run of the original density control is told, and what it makes of a splat. Follows shared.wgsl.
+// Uniforms and flags of a run of the original density control. Follows shared.wgsl.
 
 struct OriginalRun {
     splats: u32,
@@ -9,7 +9,7 @@ struct OriginalRun {
     // Log scales above which splats are split, and removed.
     log_split: f32,
     log_huge: f32,
-    // 1 where nothing is removed.
+    // 1 if nothing is removed.
     keeps_all: u32,
     // Always 0, for rounded.
     zero: u32,
@@ -18,7 +18,7 @@ struct OriginalRun {
 @group(0) @binding(0) var<uniform> run: OriginalRun;
 @group(0) @binding(1) var<storage, read> geometry: array<f32>;
 
-// Bits of what is told of a splat: finite and not faint; larger than what is cloned; it grows.
+// Flags of a splat: finite and not faint; larger than cloned splats; grows.
 const LIVES = 1u;
 const LARGE = 2u;
 const GROWS = 4u;

@@ -1,5 +1,4 @@
-// project: splats and camera to 2D splats. Follows geometry.wgsl, and waiting_colors.wgsl in fits, where
-// colours are brought up to date before they are evaluated.
+// project: splats and camera to 2D splats. Follows geometry.wgsl; in fits also waiting_colors.wgsl.
 
 // Of culled splats, the radii alone.
 @group(0) @binding(4) var<storage, read_write> splats2d: array<Splat2d>;
@@ -35,7 +34,7 @@ fn project(
         let p = root_cyy / root_det;
         let q = -(sxy / root_cyy) / root_det;
         let r = 1.0 / root_cyy;
-        // Below 0 where the opacity was lowered under ALPHA_MIN.
+        // Below 0 if the opacity fell below ALPHA_MIN.
         let reach = max(2.0 * log(opacity / ALPHA_MIN), 0.0);
         let radii = vec2(sqrt(reach * cxx), sqrt(reach * cyy));
         let center = view.focal * (g.t.xy / g.t.z) + view.principal;

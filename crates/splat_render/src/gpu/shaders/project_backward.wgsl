@@ -1,8 +1,7 @@
-// project_backward: gradients of the 2D splats to gradients of the splats and the camera. Follows
-// splat_backward.wgsl.
+// project_backward: gradients of splats and camera. Follows splat_backward.wgsl.
 
 @group(0) @binding(4) var<storage, read> splats2d: array<Splat2d>;
-// GRADIENT floats per splat: mean 2, factor 3, depth, colour 3, opacity.
+// GRADIENT floats per splat: mean 2, factor 3, depth, color 3, opacity.
 @group(0) @binding(5) var<storage, read> v_splats2d: array<f32>;
 @group(0) @binding(6) var<storage, read_write> v_geometry: array<f32>;
 @group(0) @binding(7) var<storage, read_write> v_colors: array<f32>;

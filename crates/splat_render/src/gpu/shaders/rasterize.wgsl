@@ -1,5 +1,5 @@
-// rasterize: every tile's splats, front to back, to colours, depth and final transmittance. A
-// thread owns four neighbouring pixels of each of ROWS rows, so that a splat is read once for all of
+// rasterize: every tile's splats, front to back, to colors, depth and final transmittance. A
+// thread owns four neighboring pixels of each of ROWS rows, so that a splat is read once for all of
 // them. Follows shared.wgsl and tile_memory.wgsl or tile_subgroup.wgsl.
 
 @group(0) @binding(0) var<uniform> view: View;
@@ -7,15 +7,15 @@
 @group(0) @binding(2) var<storage, read> splats2d: array<Splat2d>;
 @group(0) @binding(3) var<storage, read> tile_begin: array<u32>;
 @group(0) @binding(4) var<storage, read> splat_from_pair: array<u32>;
-// Colour over the background and final transmittance, row-major. Where a tile's list goes on in the
-// next dispatch: colour so far and transmittance, negative where the pixel has stopped.
+// Color over the background and final transmittance, row-major. If a tile's list continues in the next
+// dispatch: color so far and transmittance, negative once the pixel has stopped.
 @group(0) @binding(5) var<storage, read_write> picture: array<vec4<f32>>;
 @group(0) @binding(6) var<storage, read_write> depths: array<f32>;
 
 // In one row: llvmpipe fills its vectors along x alone.
 const THREADS = 64u / ROWS;
 
-// Four neighbouring pixels.
+// Four neighboring pixels.
 struct Quad {
     live: vec4<bool>,
     transmittance: vec4<f32>,
@@ -25,7 +25,7 @@ struct Quad {
     depth: vec4<f32>,
 }
 
-// What the dispatch before left of a pixel: `picture`, and the depth.
+// A pixel's state after the previous dispatch: `picture`, and the depth.
 struct Kept {
     pixel: vec4<f32>,
     depth: f32,
@@ -122,7 +122,7 @@ fn rasterize(
     let y = (tile / view.tiles_x) * TILE + ROWS * (thread / 4u);
     let center_x = f32(x) + vec4(0.5, 1.5, 2.5, 3.5);
     let center_y = f32(y) + 0.5;
-    // A line with {row} stands once for each of the thread's rows: shaders.rs repeats it. A loop over
+    // A line with {row} stands once for each of the thread's rows: gpu/kernels repeats it. A loop over
     // an array of rows is not unrolled by every driver, and then lives in memory.
     var quad{row} = start(x, y + {row}u);
     var walking = true;

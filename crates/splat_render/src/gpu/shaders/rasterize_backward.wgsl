@@ -1,7 +1,7 @@
-// rasterize_backward: gradients of the picture to a gradient per (splat, tile) pair, each in its
-// own slot. Walks front to back like rasterize, so that both round and stop alike; what lies
-// behind the current splat is what is left of the pixel's total. Follows shared.wgsl and
-// tile_memory.wgsl with tile_sums_memory.wgsl, or their twins for subgroups.
+// rasterize_backward: gradients of the picture to a gradient per (splat, tile) pair, each in a separate
+// slot. Walks front to back like rasterize, so that both round and stop alike; the light behind the
+// current splat is the pixel's total minus the light so far. Follows shared.wgsl and tile_memory.wgsl
+// with tile_sums_memory.wgsl, or their variants for subgroups.
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> chunk: Chunk;
@@ -9,28 +9,28 @@
 @group(0) @binding(3) var<storage, read> tile_begin: array<u32>;
 @group(0) @binding(4) var<storage, read> splat_from_pair: array<u32>;
 @group(0) @binding(5) var<storage, read> slot_from_pair: array<u32>;
-// Gradients of colour (xyz) and accumulated depth (w).
+// Gradients of color (xyz) and accumulated depth (w).
 @group(0) @binding(6) var<storage, read> v_picture: array<vec4<f32>>;
-// Per pixel: colour . v_color + depth v_depth - transmittance v_alpha, background included; less
-// what has been walked where a tile's list goes on in the next dispatch.
+// Per pixel: color . v_color + depth v_depth - transmittance v_alpha, background included; minus the
+// light so far if a tile's list continues in the next dispatch.
 @group(0) @binding(7) var<storage, read_write> totals: array<f32>;
-// SUMS floats per slot: sums of g u, g v, g u^2, g u v, g v^2 with g the gradient of sigma, then
-// depth, colour 3, opacity, and where asked for the absolute gradients of the mean: |g u| (times p
-// that of x) and that of y.
+// SUMS floats per slot: sums of g u, g v, g u^2, g u v, g v^2 with g the gradient of sigma, then depth,
+// color 3, opacity, and on request the absolute gradients of the mean: |g u| (times p for x) and the one
+// for y.
 @group(0) @binding(8) var<storage, read_write> slots: array<f32>;
-// Between such dispatches: transmittance, negative where the pixel has stopped.
+// Between such dispatches: transmittance, negative once the pixel has stopped.
 @group(0) @binding(9) var<storage, read_write> transmittances: array<f32>;
 
 // In one row: llvmpipe fills its vectors along x alone.
 const THREADS = 64u / ROWS;
 
-// Four neighbouring pixels.
+// Four neighboring pixels.
 struct Quad {
     center_x: vec4<f32>,
     center_y: f32,
     live: vec4<bool>,
     transmittance: vec4<f32>,
-    // Sum over what is still to come, of weight times value times gradient.
+    // Sum over the remaining splats of weight times value times gradient.
     remaining: vec4<f32>,
     v_red: vec4<f32>,
     v_green: vec4<f32>,
@@ -72,7 +72,7 @@ fn total_of(pixel: u32) -> f32 {
     return totals[pixel];
 }
 
-// Negative where the pixel has stopped, as those outside have.
+// Negative once the pixel has stopped, and outside the picture.
 fn transmittance_of(pixel: u32) -> f32 {
     if pixel == 0xffffffffu {
         return -1.0;
@@ -233,7 +233,7 @@ fn rasterize_backward(
             break;
         }
     }
-    // What lies behind the tile's early stop, and, for the last tile, behind all tiles.
+    // Slots after the tile's early stop and, for the last tile, after all tiles.
     write_zeros(written, end, thread);
     if tile + 1u == chunk.tile_end && chunk.list_begin == 0u {
         write_zeros(tile_begin[relative + 1u], tile_begin[relative + 2u], thread);

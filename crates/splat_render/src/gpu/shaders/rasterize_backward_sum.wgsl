@@ -1,5 +1,5 @@
 // rasterize_backward_sum: adds a splat's slots in their order and finishes the moments to the
-// gradients of its centre and factor. Follows shared.wgsl.
+// gradients of its center and factor. Follows shared.wgsl.
 
 @group(0) @binding(0) var<uniform> chunk: Chunk;
 @group(0) @binding(1) var<storage, read> status: Status;
@@ -7,8 +7,8 @@
 @group(0) @binding(3) var<storage, read> order: array<u32>;
 @group(0) @binding(4) var<storage, read> offsets: array<u32>;
 @group(0) @binding(5) var<storage, read> slots: array<f32>;
-// SUMS floats per splat: mean 2, factor 3, depth, colour 3, opacity, and the absolute mean 2 where
-// asked for; raw sums until the picture's last chunk.
+// SUMS floats per splat: mean 2, factor 3, depth, color 3, opacity, and on request the absolute mean 2;
+// raw sums until the picture's last chunk.
 @group(0) @binding(6) var<storage, read_write> v_splats2d: array<f32>;
 
 @compute @workgroup_size(64)

@@ -1,7 +1,7 @@
 // Structs and functions that several stages share. The constants that precede this text are
 // written from constants.rs and sh.rs; layout.rs holds the Rust twins of the structs.
 
-// A camera, the picture's background and how colours and parameters are stored.
+// A camera, the picture's background and how colors and parameters are stored.
 struct View {
     // Rows of the world-to-camera matrix.
     world_to_camera: array<vec4<f32>, 3>,
@@ -17,14 +17,14 @@ struct View {
     height: u32,
     tiles_x: u32,
     sh_degree: u32,
-    // Stored coefficients per splat, 0 for direct colours.
+    // Stored coefficients per splat, 0 for direct colors.
     sh_stride: u32,
-    // 1 where scales are logarithms and opacities logits.
+    // 1 if scales are logarithms and opacities logits.
     raw: u32,
-    // 1 where opacities are lowered by what the blur adds to a splat's area.
+    // 1 if opacities are lowered to compensate for the area that the blur adds.
     antialiased: u32,
-    // Splats with a hash below the first are left out (0 for none), opacities of the others times
-    // the last. As is_dropped in fit_device/random.rs.
+    // Splats with a hash below the threshold are dropped (0 for none); the remaining opacities are
+    // multiplied by the compensation. Matches is_dropped in fit_device/random.rs.
     dropout_threshold: u32,
     dropout_seed: u32,
     compensation: f32,
@@ -38,7 +38,7 @@ struct Window {
     groups_max: u32,
 }
 
-// The tiles of one dispatch (ids in row-major order) and where their pairs are counted.
+// The tiles of one dispatch (ids in row-major order) and the index of their counts.
 struct Chunk {
     tile_begin: u32,
     tile_end: u32,
@@ -59,7 +59,7 @@ struct Chunk {
 
 // Counts that only the device knows.
 struct ChunkCount {
-    // Pairs in the buffers: the total, or 0 where that does not fit.
+    // Pairs in the buffers: the total, or 0 if it does not fit.
     pairs: u32,
     // Pairs the chunk has, saturating.
     total: u32,
@@ -71,12 +71,12 @@ struct Status {
     step: u32,
     // The first step at which a chunk's pairs did not fit; stops every later update. 0 for none.
     overflow: u32,
-    // Splats in the depth order: those that are not culled, or all.
+    // Splats in the depth order: the visible ones, or all.
     visible: u32,
     chunks: array<ChunkCount>,
 }
 
-// What one step of a fit is to do.
+// Settings of one step of a fit.
 struct Step {
     // Adam's rates, then its bias corrections.
     means: f32,
@@ -87,18 +87,18 @@ struct Step {
     sh_rest: f32,
     bias_first: f32,
     bias_second: f32,
-    // Gradients of the regularisers by one opacity and one scale.
+    // Gradients of the regularizers by one opacity and one scale.
     opacity_pull: f32,
     scale_pull: f32,
     noise: f32,
     noise_seed: u32,
-    // What one unit of |x - y| and of SSIM weighs in the loss.
+    // Weights of one unit of |x - y| and of SSIM in the loss.
     l1: f32,
     ssim: f32,
     has_weights: u32,
-    // 1 where no parameter and no moment moves.
+    // 1 if no parameter and no moment moves.
     frozen: u32,
-    // So many splats, the first ones, are moved; the others are only drawn.
+    // Number of splats, from the first, that are moved; the rest are only drawn.
     moving: u32,
 }
 
@@ -110,20 +110,20 @@ struct Splat2d {
     r: f32,
     depth: f32,
     opacity: f32,
-    // (0, 0) where culled.
+    // (0, 0) if culled.
     radii: vec2<f32>,
 }
 
-// What culled splats have as key: they go last, or are left out.
+// Key of culled splats: they are last, or dropped.
 const CULLED_KEY = 0xffffffffu;
 
-// Order of the keys as that of the depths, negative ones included.
+// Keys sort as depths do, negative ones included.
 fn depth_key(depth: f32) -> u32 {
     let bits = bitcast<u32>(depth);
     return bits ^ select(0x80000000u, 0xffffffffu, (bits >> 31u) == 1u);
 }
 
-// WGSL lets a compiler assume that no float is NaN or infinite, so only the bits tell.
+// WGSL lets a compiler assume that no float is NaN or infinite; tests on bits are safe.
 fn is_finite(x: f32) -> bool {
     return (bitcast<u32>(x) & 0x7f800000u) != 0x7f800000u;
 }
@@ -160,9 +160,9 @@ fn exp_accurate4(x: vec4<f32>) -> vec4<f32> {
     return ((poly * r * r + r) + 1.0) * bitcast<vec4<f32>>((vec4<i32>(k) + 127) << vec4(23u));
 }
 
-// What one operation made, rounded before the next one has it: where bits decide. WGSL lets a compiler fuse
-// a product with a sum (NVIDIA's does) and put sums in another order (Mesa's does). `zero` comes from a
-// uniform and is always 0. No compiler can know that, so it has to make the bits.
+// Rounds the result of one operation before the next uses it, for results that must match bit for bit.
+// WGSL lets a compiler fuse a product with a sum (NVIDIA's does) and reorder sums (Mesa's does). `zero`
+// comes from a uniform and is always 0, which no compiler can know.
 fn rounded(x: f32, zero: u32) -> f32 {
     return bitcast<f32>(bitcast<u32>(x) ^ zero);
 }
@@ -172,8 +172,8 @@ fn linear_index(workgroup: vec3<u32>, groups: vec3<u32>, local: u32, size: u32) 
     return (workgroup.y * groups.x + workgroup.x) * size + local;
 }
 
-// The same where the number of workgroups is on the device only (DX12 does not tell it there): rows of a
-// dispatch have `groups_max` wherever there is more than one.
+// The same if the number of workgroups is known only on the device (DX12 does not expose it): rows of a
+// dispatch have `groups_max` workgroups if there is more than one row.
 fn indirect_index(workgroup: vec3<u32>, groups_max: u32, local: u32, size: u32) -> u32 {
     return (workgroup.y * groups_max + workgroup.x) * size + local;
 }

@@ -1,13 +1,12 @@
 // Gradients of one 2D splat to gradients of the splat and the camera. Follows shared.wgsl and
-// geometry.wgsl; the file that follows declares what is bound, and `keep_coefficient`, which is told the
-// gradient of each stored coefficient. Formulas and names as in
-// reference/project_backward.rs.
+// geometry.wgsl; the next file declares the bindings, and `keep_coefficient`, which receives the gradient
+// of each stored coefficient. Formulas and names as in reference/project_backward.rs.
 
 struct Backward {
     geometry: array<f32, GEOMETRY>,
     camera: array<f32, CAMERA>,
-    // Of the colour before the cut at zero, and the direction it is seen along: the gradient of each
-    // coefficient is its basis function there times that of the colour.
+    // Gradient of the color before the clamp at zero, and the viewing direction. A coefficient's gradient
+    // is its basis function at the direction times the color's.
     v_color: vec3<f32>,
     direction: vec3<f32>,
     // Whether there is a gradient at all.
@@ -45,13 +44,13 @@ fn keep_zeros(i: u32) {
     }
 }
 
-// Keeps the gradient of one coefficient; what it adds to that of the direction.
+// Stores the gradient of one coefficient; returns its part of the direction's gradient.
 fn coefficient_backward(row: u32, term: Term, v_color: vec3<f32>) -> vec3<f32> {
     keep_coefficient(row, term.value * v_color);
     return term.derivative * dot(v_color, coefficient(row));
 }
 
-// Gradients of all coefficients of a splat; returns that of the direction.
+// Gradients of all coefficients of a splat; returns the direction's.
 fn sh_backward(i: u32, direction: vec3<f32>, v_color: vec3<f32>) -> vec3<f32> {
     let row = i * mode.sh_stride;
     var v_direction = coefficient_backward(row, Term(SH_C0, vec3(0.0)), v_color);
@@ -99,7 +98,7 @@ fn sh_backward(i: u32, direction: vec3<f32>, v_color: vec3<f32>) -> vec3<f32> {
     return v_direction;
 }
 
-// Gradients of a splat that is not culled; those of its coefficients are kept.
+// Gradients of a splat that is not culled; stores the coefficients'.
 fn splat_backward(i: u32) -> Backward {
     var none: Backward;
     let g = load_geometry(i);
@@ -121,7 +120,7 @@ fn splat_backward(i: u32) -> Backward {
     var v_rotation = mat3x3<f32>();
     var finite = true;
 
-    // Colour and, through the view direction, t and the rotation.
+    // Color and, through the view direction, t and the rotation.
     var direction = vec4(0.0);
     if mode.sh_stride == 0u {
         keep_coefficient(i, v_color);
@@ -159,10 +158,10 @@ fn splat_backward(i: u32) -> Backward {
     var v_m0 = p * v_fm_u;
     var v_m1 = q * v_fm_u + r * v_fm_v;
     if mode.antialiased {
-        // With S = M M^T and C = S + blur I, ln compensation = (ln det S - ln det C) / 2 has the
-        // gradient S^-1 M - C^-1 M, whose terms cancel for large splats; it is blur C^-1 S^-1 M.
-        // The rows of S^-1 M are m1 x n / n^2 and n x m0 / n^2 with n = m0 x m1; divided by the
-        // length twice, since its square may underflow where it does not.
+        // With S = M M^T and C = S + blur I, ln compensation = (ln det S - ln det C) / 2 has the gradient
+        // S^-1 M - C^-1 M, whose terms cancel for large splats; it is blur C^-1 S^-1 M. The rows of S^-1
+        // M are m1 x n / n^2 and n x m0 / n^2 with n = m0 x m1, divided by the length twice, since its
+        // square may underflow.
         let area = sharp_area(g);
         let length_area = length(area);
         let n = area / length_area / length_area;
@@ -177,7 +176,7 @@ fn splat_backward(i: u32) -> Backward {
     let v_b0 = v_m0 * g.scales;
     let v_b1 = v_m1 * g.scales;
 
-    // Axes -> quaternion, through its normalisation.
+    // Axes -> quaternion, through its normalization.
     let v_unit = quat_gradient(g.quat, outer(g.a0, v_b0) + outer(g.a1, v_b1));
     let v_quat = (v_unit - dot(v_unit, g.quat) * g.quat) / g.quat_norm;
 
@@ -194,7 +193,7 @@ fn splat_backward(i: u32) -> Backward {
         -(v_a0 * (per_z.x * g.ratio.x)) - v_a1 * (per_z.y * g.ratio.y),
     ));
 
-    // J, with x/z and y/z held where they are limited.
+    // J, with clamped x/z and y/z held constant.
     var v_focal = vec2(v_j00 - v_j02 * g.ratio.x, v_j11 - v_j12 * g.ratio.y) / z;
     var v_principal = vec2(0.0);
     v_t.z += (per_z.x * (v_j02 * g.ratio.x - v_j00) + per_z.y * (v_j12 * g.ratio.y - v_j11)) / z;
@@ -215,7 +214,7 @@ fn splat_backward(i: u32) -> Backward {
         v_principal.y -= v_ratio.y / view.focal.y;
     }
 
-    // Centre and depth.
+    // Center and depth.
     v_focal += v_center * xy;
     v_principal += v_center;
     v_t += vec3(v_center * per_z, v_depth - dot(v_center * per_z, xy));
@@ -249,7 +248,7 @@ fn splat_backward(i: u32) -> Backward {
     camera[13] = v_focal.y;
     camera[14] = v_principal.x;
     camera[15] = v_principal.y;
-    // A gradient that leaves f32 says nothing of where to go; as zero it harms nothing.
+    // Gradients outside f32's range give no direction; zero is harmless.
     for (var k = 0u; k < GEOMETRY; k++) {
         finite = finite && is_finite(row[k]);
     }

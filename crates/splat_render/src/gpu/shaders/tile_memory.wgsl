@@ -1,5 +1,4 @@
-// How the threads of a tile share its splats, on any device: each reads every splat from storage
-// (staging them in workgroup memory was slower). tile_subgroup.wgsl is the other way.
+// Each thread of a tile reads every splat from storage: for any device (see tile_subgroup.wgsl).
 
 // Pairs that are read at once.
 const AHEAD = 1u;

@@ -1,5 +1,4 @@
-// Sums over the threads of a tile, on any device: through workgroup memory, for a batch of splats
-// between two barriers.
+// Sums over the threads of a tile through workgroup memory, a batch of splats between two barriers.
 
 // 60 sums occupy 32 threads almost twice.
 const BATCH = 6u;

@@ -1,5 +1,4 @@
-// Sums over the threads of a tile where they are one subgroup: thread b keeps those of a batch's
-// splat b and writes them.
+// Sums over a tile that is one subgroup: thread b writes the sums of a batch's splat b.
 
 const BATCH = AHEAD;
 

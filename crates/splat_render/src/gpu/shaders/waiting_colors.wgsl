@@ -1,15 +1,13 @@
-// Colours that wait: a step leaves a splat's colours as they are and keeps their gradient, and when the
-// splat is next projected, that step and all that followed without a gradient are done in one go. So
-// colours and moments of splats out of sight are neither read nor written. As cpu/waiting_colors.rs.
-// Follows geometry.wgsl and adam_step.wgsl.
+// Colors that wait: a step keeps a splat's color gradient, and all waiting steps are done in one go when
+// the splat is next projected. As cpu/waiting_colors.rs. Follows geometry.wgsl and adam_step.wgsl.
 
-// The steps that colours may wait for.
+// The steps that colors may wait for.
 struct ColorSteps {
-    // So many there are; the step at hand is not among them.
+    // Number of steps, without the current one.
     count: u32,
-    // So many splats, the first ones, have colours that move.
+    // Number of splats, from the first, whose colors move.
     moving: u32,
-    // Rates of the first coefficient and of the others, bias corrections of both moments.
+    // Rates of the first coefficient and the rest, bias corrections of both moments.
     steps: array<vec4<f32>, COLOR_WAIT>,
 }
 
@@ -63,7 +61,7 @@ fn sh_basis(d: vec3<f32>) -> array<f32, SH_COEFFS_MAX> {
     return basis;
 }
 
-// Does all steps that a splat's colours wait for; none once a chunk's pairs did not fit, since the step
+// Does all steps that a splat's colors wait for; none once a chunk's pairs did not fit, since the step
 // is then done again.
 fn catch_up(i: u32) {
     let note = i * NOTES;
@@ -120,7 +118,7 @@ fn catch_up(i: u32) {
     notes[note + NOTE_WAITS] = waiting.count << 1u;
 }
 
-// Brings all colours up to date; the steps that they waited for are then forgotten.
+// Brings all colors up to date; the steps that they waited for are then forgotten.
 @compute @workgroup_size(64)
 fn catch_up_all(
     @builtin(workgroup_id) workgroup: vec3<u32>,

@@ -51,7 +51,6 @@ impl Component {
 
 /// An accessor whose numbers are all within its buffer.
 pub struct Accessor<'a> {
-    /// Rows.
     pub count: usize,
     bytes: &'a [u8],
     stride: usize,
@@ -65,18 +64,20 @@ impl<'a> Accessor<'a> {
         let bad = |what: &str| document.bad(format!("has an attribute '{name}' {what}"));
         let accessor = document.item("accessors", index)?;
         if accessor.get("sparse").is_some() {
-            return Err(bad("that is sparse, which cannot be read: write it plain"));
+            return Err(bad(
+                "that is sparse, which cannot be read: write it without sparse accessors",
+            ));
         }
         let kind = accessor.get("type").and_then(Value::as_str);
         let wanted = ["SCALAR", "VEC2", "VEC3", "VEC4"][width - 1];
         if kind != Some(wanted) {
-            return Err(bad(&format!("that is no {wanted}")));
+            return Err(bad(&format!("that is not {wanted}")));
         }
         let component = accessor
             .get("componentType")
             .and_then(Value::as_u64)
             .and_then(Component::of)
-            .ok_or_else(|| bad("of a component type that splats do not have"))?;
+            .ok_or_else(|| bad("of an unsupported component type"))?;
         let count = number(accessor, "count").filter(|&count| count as u64 <= SPLATS_MAX);
         let count = count.ok_or_else(|| bad("without a count below 2^30"))?;
         let view = number(accessor, "bufferView");
@@ -94,7 +95,6 @@ impl<'a> Accessor<'a> {
         Ok(Self { count, bytes, stride, component, normalized })
     }
 
-    /// Row `i`.
     pub fn row<const N: usize>(&self, i: usize) -> [f32; N] {
         let start = i * self.stride;
         std::array::from_fn(|k| {

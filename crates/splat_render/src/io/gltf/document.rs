@@ -18,7 +18,6 @@ const VALUES_MAX: usize = 1 << 18;
 
 /// A file's JSON and buffers.
 pub struct Document<'a> {
-    /// The JSON.
     pub json: Value,
     /// Place in `stores` of each buffer's bytes.
     buffers: Vec<usize>,
@@ -50,12 +49,11 @@ impl<'a> Document<'a> {
         Ok(document)
     }
 
-    /// Bytes of all buffers: what counts of splats are held against.
+    /// Bytes of all buffers, to check counts of splats against.
     pub fn size(&self) -> usize {
         self.stores.iter().map(|store| store.len()).sum()
     }
 
-    /// An error about this file.
     pub fn bad(&self, reason: impl Into<String>) -> crate::Error {
         self.named.bad(reason)
     }
@@ -86,8 +84,7 @@ impl<'a> Document<'a> {
         Ok((bytes, number(view, "byteStride")))
     }
 
-    /// The place in `stores` of buffer `k`'s bytes. Of other files, `files` knows the place: many
-    /// buffers may share one, which is in memory once.
+    /// The index in `stores` of buffer `k`'s bytes; `files` caches other files' indices.
     fn buffer(
         &mut self,
         k: usize,
@@ -104,14 +101,14 @@ impl<'a> Document<'a> {
             (_, Some((kind, data)), _) if kind.starts_with("data:") => {
                 let bytes = STANDARD
                     .decode(data)
-                    .map_err(|e| self.bad(format!("has buffers[{k}] that is no base64 ({e})")))?;
+                    .map_err(|e| self.bad(format!("has buffers[{k}] that is not base64 ({e})")))?;
                 (next, Some(Cow::Owned(bytes)))
             }
             (Some(uri), _, _) => match files.get(uri) {
                 Some(&place) => (place, None),
                 None => {
                     files.insert(uri.to_owned(), next);
-                    (next, Some(Cow::Owned(self.neighbour(uri)?)))
+                    (next, Some(Cow::Owned(self.neighbor(uri)?)))
                 }
             },
             (None, _, Some(binary)) if k == 0 => (next, Some(Cow::Borrowed(binary))),
@@ -121,14 +118,14 @@ impl<'a> Document<'a> {
         let found = self.stores[place].len();
         if found < length {
             return Err(self.bad(format!(
-                "has buffers[{k}] of {found} bytes where {length} belong; it is truncated"
+                "has buffers[{k}] of {found} bytes instead of {length}; it is truncated"
             )));
         }
         Ok(place)
     }
 
     /// The bytes of a file in the same folder or below it.
-    fn neighbour(&self, uri: &str) -> Result<Vec<u8>> {
+    fn neighbor(&self, uri: &str) -> Result<Vec<u8>> {
         use std::io::Read;
         let name = percent_decoded(uri);
         let plain = Path::new(&name).components().all(|part| matches!(part, Component::Normal(_)));
@@ -147,7 +144,7 @@ impl<'a> Document<'a> {
     }
 }
 
-/// At most so many values are in a JSON text: each but the first follows a mark outside strings.
+/// Upper bound on the number of values in a JSON text: each but the first follows a mark outside strings.
 fn values(text: &[u8]) -> usize {
     let (mut count, mut quoted, mut escaped) = (1, false, false);
     for byte in text {
@@ -162,7 +159,6 @@ fn values(text: &[u8]) -> usize {
     count
 }
 
-/// The JSON and, if any, the binary chunk of a `.glb`.
 fn split_glb<'a>(bytes: &'a [u8], named: &Named<'a>) -> Result<(&'a [u8], Option<&'a [u8]>)> {
     let mut rest = Bytes::new(bytes, named);
     let header = rest.take(12, "header")?;

@@ -17,12 +17,11 @@ const EXTENSION: &str = "KHR_gaussian_splatting";
 const ROTATION: &str = "KHR_gaussian_splatting:ROTATION";
 const SCALE: &str = "KHR_gaussian_splatting:SCALE";
 const OPACITY: &str = "KHR_gaussian_splatting:OPACITY";
-/// Highest SH degree of the format.
 const SH_DEGREE: u32 = 3;
 /// The only kernel that splats here have.
 const KERNEL: &str = "ellipse";
 const COLOR_SPACE: &str = "srgb_rec709_display";
-/// Where igsr keeps the antialiased flag, for which the extension has no place.
+/// Name of igsr's antialiased flag, which the extension does not define.
 const ANTIALIASED: &str = "antialiased";
 
 /// `component type` of 32-bit floats.

@@ -32,7 +32,7 @@ struct Part<'a> {
     sh: Vec<Accessor<'a>>,
 }
 
-/// Reads a whole file: all splats of its scene, those of lower SH degree padded with zeros.
+/// Reads a whole file: all splats of its scene; lower SH degrees are padded with zeros.
 pub fn parse(bytes: &[u8], format: Format, named: &Named<'_>) -> Result<Loaded> {
     let document = Document::open(bytes, format, named)?;
     let placed = placed_meshes(&document)?;
@@ -52,7 +52,7 @@ pub fn parse(bytes: &[u8], format: Format, named: &Named<'_>) -> Result<Loaded> 
             antialiased |= extras.and_then(Value::as_bool).unwrap_or(false);
             let part = Part::new(&document, primitive, at)?;
             total += part.count as u64;
-            // Nodes may show one mesh many times: the sum is what memory is taken for.
+            // Nodes may instance one mesh many times: check the sum before allocating.
             check_claim(named, total, part.degree, document.size())?;
             parts.push(part);
         }
@@ -65,7 +65,7 @@ pub fn parse(bytes: &[u8], format: Format, named: &Named<'_>) -> Result<Loaded> 
         );
     }
     if others > 0 {
-        notes.push(format!("{others} meshes that are no splats are passed over."));
+        notes.push(format!("{others} meshes without splats are ignored."));
     }
 
     let degree = parts.iter().map(|part| part.degree).max().unwrap_or(0);
@@ -79,7 +79,7 @@ pub fn parse(bytes: &[u8], format: Format, named: &Named<'_>) -> Result<Loaded> 
         first += part.count;
     }
     frame::turn(&mut splats);
-    // -0 would be another origin than 0 to whoever compares.
+    // Adding 0 turns -0 into 0, so that origins compare equal.
     let origin = frame::turn_point(origin.to_array()).map(|c| c + 0.0);
     Ok(Loaded { file: SplatFile { splats, origin, antialiased }, format, notes })
 }
@@ -106,7 +106,7 @@ fn check_extension(
     match extension.get("colorSpace").and_then(Value::as_str) {
         None | Some(COLOR_SPACE) => {}
         Some(space) => {
-            let note = format!("Colours of the space {space:?} are taken for {COLOR_SPACE:?}.");
+            let note = format!("Colors of the space {space:?} are read as {COLOR_SPACE:?}.");
             if !notes.contains(&note) {
                 notes.push(note);
             }

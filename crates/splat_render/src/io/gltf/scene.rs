@@ -1,4 +1,4 @@
-//! Where the nodes of a glTF scene put its meshes.
+//! Transforms of a glTF scene's meshes by its nodes.
 
 use glam::{DMat3, DMat4, DQuat, DVec3};
 use serde_json::Value;
@@ -6,19 +6,13 @@ use serde_json::Value;
 use super::document::{Document, number};
 use crate::error::Result;
 
-/// By how much the axes of a node may differ in length and from right angles, relatively: float32
-/// matrices are off by less.
+/// Relative tolerance of a node's axes in length and angle; float32 matrices are within it.
 const SHAPE_TOLERANCE: f64 = 1e-4;
 
-/// A mesh at a place.
 pub struct Placed {
-    /// Its index.
     pub mesh: usize,
-    /// The turn, if any.
     pub rotation: Option<DQuat>,
-    /// The uniform scale.
     pub scale: f64,
-    /// The shift.
     pub translation: DVec3,
 }
 
@@ -27,7 +21,7 @@ pub fn placed_meshes(document: &Document<'_>) -> Result<Vec<Placed>> {
     let scene = number(&document.json, "scene").unwrap_or(0);
     let roots = match document.list("scenes").get(scene) {
         Some(scene) => indices(scene, "nodes"),
-        // A file may do without scenes; then all nodes that are nobody's child are shown.
+        // Without scenes, all root nodes are shown.
         None => {
             let nodes = document.list("nodes");
             let children: std::collections::HashSet<usize> =
@@ -42,7 +36,9 @@ pub fn placed_meshes(document: &Document<'_>) -> Result<Vec<Placed>> {
     while let Some((index, parent)) = open.pop() {
         let node = document.item("nodes", index)?;
         if std::mem::replace(&mut seen[index], true) {
-            return Err(document.bad(format!("shows nodes[{index}] twice, which no glTF may")));
+            return Err(
+                document.bad(format!("shows nodes[{index}] twice, which glTF does not allow"))
+            );
         }
         let matrix = parent * local_matrix(node);
         if let Some(mesh) = number(node, "mesh") {

@@ -75,15 +75,11 @@ impl Attributes {
     }
 }
 
-/// The whole file.
 pub fn encode(file: &SplatFile, format: Format, notes: &mut Vec<String>) -> Result<Vec<u8>> {
     let mut splats = prepare(file, &ROOM, notes).into_owned();
     frame::turn(&mut splats);
     if file.antialiased {
-        notes.push(
-            "glTF has no place for the antialiased flag: it is kept where only igsr reads it."
-                .to_owned(),
-        );
+        notes.push("glTF has no place for the antialiased flag: only igsr reads it.".to_owned());
     }
     let mut document = json!({
         "asset": { "version": "2.0", "generator": concat!("igsr ", env!("CARGO_PKG_VERSION")) },
@@ -133,7 +129,7 @@ fn glb(document: &Value, mut binary: Vec<u8>) -> Result<Vec<u8>> {
         &[(CHUNK_JSON, &text), (CHUNK_BINARY, &binary)]
     };
     let length = 12 + chunks.iter().map(|(_, chunk)| 8 + chunk.len()).sum::<usize>();
-    let length = u32::try_from(length).map_err(|_| unfit("a .glb holds 4 GiB"))?;
+    let length = u32::try_from(length).map_err(|_| unfit("a .glb holds at most 4 GiB"))?;
     let mut out = Vec::with_capacity(length as usize);
     out.extend(MAGIC);
     out.extend(2u32.to_le_bytes());
@@ -149,7 +145,7 @@ fn glb(document: &Value, mut binary: Vec<u8>) -> Result<Vec<u8>> {
 
 fn gltf(mut document: Value, binary: &[u8]) -> Result<Vec<u8>> {
     if binary.len() > TEXT_MAX / 2 {
-        return Err(unfit("a .gltf of so many would be too large to read again; write a .glb"));
+        return Err(unfit("a .gltf of this size would be too large to read; write a .glb"));
     }
     if !binary.is_empty() {
         let data = STANDARD.encode(binary);

@@ -2,8 +2,7 @@
 
 use super::CODES;
 
-/// Rounds of Lloyd's iteration. From a start at quantiles the error no longer falls visibly after
-/// a dozen.
+/// Rounds of Lloyd's iteration; from quantiles, a dozen suffice.
 const ROUNDS: usize = 12;
 
 /// The codebook for `values`, ascending. Values that are few get a code each.
@@ -15,8 +14,7 @@ pub fn codebook(values: impl Iterator<Item = f32>) -> Vec<f32> {
     let mut codes: Vec<f32> = if distinct.len() <= CODES {
         distinct
     } else {
-        // Half at quantiles, which follow the values' density, half evenly, which bound the error
-        // of the rare ones.
+        // Half at quantiles, which follow the density, half evenly, which bound the error of rare values.
         let half = CODES / 2;
         let (low, high) = (distinct[0], distinct[distinct.len() - 1]);
         let quantiles = (0..half).map(|k| sorted[(2 * k + 1) * sorted.len() / CODES]);

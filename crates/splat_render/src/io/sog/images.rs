@@ -14,13 +14,13 @@ use crate::io::bytes::Named;
 use crate::io::limits::unpacked_max;
 use crate::io::open::open_file;
 
-/// Pixels that an image may have beyond those that are used: writers round sizes up.
+/// Unused pixels that an image may have: writers round sizes up.
 const SPARE_PIXELS: u64 = 1 << 16;
 
 /// Longest meta.json that is read: real ones are 20 kB, and JSON takes many times its text.
 const META_MAX: u64 = 1 << 20;
 
-/// Where the files lie.
+/// Location of the files.
 enum Place<'a> {
     /// The zip of a `.sog`, and the bytes that an entry may unpack to.
     Zip(Box<ZipArchive<Cursor<&'a [u8]>>>, u64),
@@ -28,28 +28,25 @@ enum Place<'a> {
     Folder(PathBuf),
 }
 
-/// The files of a SOG.
 pub struct Bundle<'a> {
     place: Place<'a>,
     named: Named<'a>,
 }
 
 impl<'a> Bundle<'a> {
-    /// Opens the zip in `bytes`.
     pub fn open(bytes: &'a [u8], named: &Named<'a>) -> Result<Self> {
         let zip = ZipArchive::new(Cursor::new(bytes)).map_err(|e| {
-            named.bad(format!("cannot be opened as the zip that a .sog is ({e}); copy it again"))
+            named.bad(format!("cannot be opened as the zip of a .sog ({e}); copy it again"))
         })?;
         Ok(Self { place: Place::Zip(Box::new(zip), unpacked_max(bytes.len())), named: *named })
     }
 
-    /// The files beside the `meta.json` that is named.
+    /// The files next to a `meta.json`.
     pub fn beside(named: &Named<'a>) -> Self {
         let folder = named.0.parent().unwrap_or(Path::new("")).to_owned();
         Self { place: Place::Folder(folder), named: *named }
     }
 
-    /// The text of `meta.json`.
     pub fn meta(&mut self) -> Result<Vec<u8>> {
         self.file(META, META_MAX)
     }
@@ -66,14 +63,14 @@ impl<'a> Bundle<'a> {
         };
         let mut parts = Path::new(name).components();
         if !matches!((parts.next(), parts.next()), (Some(Component::Normal(_)), None)) {
-            return Err(unreadable(&self.named, name, &"it lies in another folder"));
+            return Err(unreadable(&self.named, name, &"it is in another folder"));
         }
         let file = open_file(&folder.join(name)).map_err(|e| unreadable(&self.named, name, &e))?;
         let size = file.metadata().map_err(|e| unreadable(&self.named, name, &e))?.len();
         Ok((file, size))
     }
 
-    /// The first `limit` bytes of the file `name`; None: what may be unpacked.
+    /// The first `limit` bytes of the file `name`; None means the limit for unpacked data.
     fn file(&mut self, name: &str, limit: impl Into<Option<u64>>) -> Result<Vec<u8>> {
         let (limit, named) = (limit.into(), self.named);
         let mut bytes = Vec::new();
@@ -104,7 +101,7 @@ impl<'a> Bundle<'a> {
         let used = used as u64;
         if pixels < used || pixels > 2 * used + SPARE_PIXELS {
             return Err(self.named.bad(format!(
-                "has an image '{name}' of {width}x{height} pixels where {used} are used; it is \
+                "has an image '{name}' of {width}x{height} pixels, but {used} are used; it is \
                  damaged"
             )));
         }
@@ -123,9 +120,7 @@ fn unreadable(named: &Named<'_>, name: &str, why: &dyn std::fmt::Display) -> Err
     named.bad(format!("has no readable '{name}' in it ({why}); export it again"))
 }
 
-/// Pixels.
 pub struct Image {
-    /// Pixels per row.
     pub width: usize,
     /// All pixels, the top row first.
     pub rgba: Vec<[u8; 4]>,

@@ -1,4 +1,4 @@
-//! `meta.json`: what the images are called and how their bytes count.
+//! `meta.json`: the names of the images and the scales of their bytes.
 
 use serde_json::{Value, json};
 
@@ -6,15 +6,12 @@ use super::{CODES, SH_DEGREE};
 use crate::error::Result;
 use crate::io::bytes::Named;
 
-/// The whole of it.
 pub struct Meta {
-    /// Number of splats.
     pub count: u64,
-    /// Whether opacities are antialiased.
     pub antialiased: bool,
     /// Bounds of the positions' signed logarithms.
     pub low: [f64; 3],
-    /// The other bound.
+    /// The upper bound.
     pub high: [f64; 3],
     /// Images of the positions' low and high bytes.
     pub means: [String; 2],
@@ -30,17 +27,13 @@ pub struct Meta {
 
 /// Values by code, and the image of codes.
 pub struct Coded {
-    /// Value of each code.
     pub codebook: Vec<f32>,
-    /// Name of the image.
     pub image: String,
 }
 
-/// Higher SH.
 pub struct Rest {
     /// Rows of the palette.
     pub count: usize,
-    /// SH degree.
     pub degree: u32,
     /// Coefficients by code.
     pub codebook: Vec<f32>,
@@ -51,10 +44,9 @@ pub struct Rest {
 }
 
 impl Meta {
-    /// Reads the JSON.
     pub fn read(text: &[u8], named: &Named<'_>) -> Result<Self> {
         let meta: Value = serde_json::from_slice(text)
-            .map_err(|e| named.bad(format!("has a meta.json that is no JSON ({e})")))?;
+            .map_err(|e| named.bad(format!("has a meta.json that is not JSON ({e})")))?;
         let missing = |what: &str| {
             named.bad(format!("has no valid '{what}' in its meta.json; export it again"))
         };
@@ -65,7 +57,8 @@ impl Meta {
             }
             None => {
                 return Err(named.bad(
-                    "is a .sog of version 1; export it again as version 2, with SuperSplat say",
+                    "is a .sog of version 1; export it again as version 2, for example with \
+                     SuperSplat",
                 ));
             }
         }
@@ -108,14 +101,12 @@ impl Meta {
         })
     }
 
-    /// Names of all images.
     pub fn files(&self) -> impl Iterator<Item = &str> {
         let rest = self.rest.iter().flat_map(|rest| [&rest.centroids, &rest.labels]);
         let others = [&self.scales.image, &self.quats, &self.sh0.image];
         self.means.iter().chain(others).chain(rest).map(String::as_str)
     }
 
-    /// The JSON.
     pub fn write(&self) -> String {
         let coded = |part: &Coded| json!({ "codebook": part.codebook, "files": [part.image] });
         let mut meta = json!({

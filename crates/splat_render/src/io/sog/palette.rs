@@ -12,7 +12,7 @@ pub struct Palette {
     pub labels: Vec<u16>,
 }
 
-/// A range of the ids, its squared error, and where it is widest.
+/// A range of the ids, its squared error, and its widest axis.
 struct Group {
     start: usize,
     end: usize,
@@ -75,7 +75,7 @@ pub fn palette(vectors: &[f32], width: usize, rows_max: usize) -> Palette {
         members.sort_by_key(|&id| vector(id)[axis] > middle);
         let split = members.partition_point(|&id| vector(id)[axis] <= middle);
         if split == 0 || split == members.len() {
-            // All alike, but for what rounding leaves.
+            // All equal, up to rounding.
             whole.push(widest);
             continue;
         }

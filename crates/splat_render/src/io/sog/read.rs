@@ -10,14 +10,13 @@ use crate::io::quantize::{SmallestThree, logit_of_byte, to_f32};
 use crate::io::{Format, Loaded, SplatFile};
 use crate::splats::SplatArrays;
 
-/// Reads a whole file.
 pub fn parse(bytes: &[u8], named: &Named<'_>) -> Result<Loaded> {
     let mut bundle = Bundle::open(bytes, named)?;
     let meta = Meta::read(&bundle.meta()?, named)?;
     unpack(&meta, &mut bundle, bytes.len(), named)
 }
 
-/// Reads a `meta.json` and the images beside it.
+/// Reads a `meta.json` and the images next to it.
 pub fn parse_folder(named: &Named<'_>) -> Result<Loaded> {
     let mut bundle = Bundle::beside(named);
     let meta = Meta::read(&bundle.meta()?, named)?;
@@ -55,7 +54,7 @@ fn unpack(meta: &Meta, bundle: &mut Bundle<'_>, size: usize, named: &Named<'_>) 
         let [r, g, b, tag] = quats.rgba[i];
         let largest = tag.checked_sub(ROTATION_TAG).ok_or_else(|| {
             named.bad(format!(
-                "has a rotation tagged {tag}, where 252 to 255 are known; it is damaged"
+                "has a rotation tagged {tag}, but only 252 to 255 are known; it is damaged"
             ))
         })?;
         let others = [r, g, b].map(|c| (f64::from(c) / 255.0 - 0.5) * std::f64::consts::SQRT_2);
@@ -85,7 +84,7 @@ fn unpack_rest(
     let palette = bundle.image(&rest.centroids, used)?;
     if palette.width != PALETTE_COLUMNS * each {
         return Err(named.bad(format!(
-            "has a palette {} pixels wide where SH of degree {} take {}; it is damaged",
+            "has a palette {} pixels wide, but SH of degree {} take {}; it is damaged",
             palette.width,
             rest.degree,
             PALETTE_COLUMNS * each
@@ -99,7 +98,7 @@ fn unpack_rest(
                 rest.count
             )));
         }
-        // Rows of the image hold PALETTE_COLUMNS entries one after the other, as memory does.
+        // Rows of the image hold PALETTE_COLUMNS consecutive entries, as in memory.
         let row = &palette.rgba[label * each..][..each];
         for (k, [r, g, b, _]) in row.iter().enumerate() {
             splats.sh[i * stride + 1 + k] =

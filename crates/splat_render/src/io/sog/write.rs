@@ -28,7 +28,7 @@ const SH0: &str = "sh0.webp";
 const CENTROIDS: &str = "shN_centroids.webp";
 const LABELS: &str = "shN_labels.webp";
 
-/// The whole file. Splats are put in Morton's order: images of neighbours compress better.
+/// The whole file. Splats are put in Morton's order: images of neighbors compress better.
 pub fn encode(file: &SplatFile, notes: &mut Vec<String>) -> Result<Vec<u8>> {
     let prepared = prepare(file, &ROOM, notes);
     let splats = prepared.select(&morton_order(&prepared.means));
@@ -37,8 +37,7 @@ pub fn encode(file: &SplatFile, notes: &mut Vec<String>) -> Result<Vec<u8>> {
     zipped(&files).map_err(|e| unfit(&format!("cannot be zipped ({e})")))
 }
 
-/// Writes `meta.json` and its images into a folder that is there. The splats keep their order; all are
-/// finite, and of a degree up to 3.
+/// Writes a SOG into an existing folder. Splats keep their order; all are finite, degree at most 3.
 pub fn write_folder(folder: &Path, splats: &SplatArrays, antialiased: bool) -> Result<()> {
     for (name, bytes) in files(splats, antialiased)? {
         let path = folder.join(name);
@@ -109,7 +108,7 @@ fn files(splats: &SplatArrays, antialiased: bool) -> Result<Vec<(&'static str, V
     let mut files = Vec::new();
     for (name, image) in &images {
         let bytes = webp(image).ok_or_else(|| {
-            unfit(&format!("a .sog holds 16384 x 16384 of them, not {}", splats.len()))
+            unfit(&format!("a .sog holds at most 16384 x 16384 splats, not {}", splats.len()))
         })?;
         files.push((*name, bytes));
     }
@@ -156,7 +155,7 @@ fn signed_ln(x: f32) -> f64 {
     x.signum() * x.abs().ln_1p()
 }
 
-/// Bounds of the positions' signed logarithms; zero where there are no splats.
+/// Bounds of the positions' signed logarithms; zero without splats.
 fn bounds(splats: &SplatArrays) -> ([f64; 3], [f64; 3]) {
     let fold = |start: f64, pick: fn(f64, f64) -> f64| {
         std::array::from_fn(|k| {

@@ -1,4 +1,4 @@
-//! What exposure, loss and adam must show against the f64 reference. Each check prints its figures.
+//! Conformance of exposure, loss and adam with the f64 reference. Each check prints its figures.
 
 use rand::Rng;
 use splat_render::fit::{Rates, Target, TargetDepth};
@@ -28,20 +28,12 @@ pub fn random_target(
         let w = rng.random::<f32>();
         if w < 0.3 { 0.0 } else { w }
     };
-    Target {
-        width,
-        height,
-        channels,
-        pixels: (0..pixels * channels as usize).map(|_| rng.random()).collect(),
-        weights: weighted.then(|| (0..pixels).map(|_| weight(rng)).collect()),
-        depth: None,
-        background: None,
-        turns: 1,
-        until: None,
-    }
+    let colors = (0..pixels * channels as usize).map(|_| rng.random()).collect();
+    let weights = weighted.then(|| (0..pixels).map(|_| weight(rng)).collect());
+    Target { weights, ..Target::new(width, height, channels, colors) }
 }
 
-/// A picture of random colours in 0..1.
+/// A picture of random colors in 0..1.
 pub fn random_picture(rng: &mut Pcg64, width: u32, height: u32) -> Image<f32> {
     let pixels = (width * height) as usize;
     Image {
@@ -118,7 +110,7 @@ pub fn exposure_matches_the_reference(stages: &dyn Stages<f32>) {
             assert!(off <= 1e-6, "{what}: v_color {off:.1e}");
             let off = difference1(&got.v_alpha, &expected.v_alpha, &[]).max;
             assert!(off <= 1e-6, "{what}: v_alpha {off:.1e}");
-            // Sums of so many numbers of either sign: by what their sizes add up to.
+            // Sums of many numbers of either sign: a bound by their number.
             let scale = 1e-6 * v.len() as f64;
             for c in 0..3 {
                 let gain = (got.v_gain[c] - expected.v_gain[c]).abs();
@@ -139,7 +131,7 @@ pub fn exposure_matches_the_reference(stages: &dyn Stages<f32>) {
     assert!(short.starts_with("v_corrected"), "{short}");
 }
 
-/// A picture that is clear in places, and depths near its own, of which some are not known.
+/// A partly transparent picture, and depths near its own, some unknown.
 pub fn random_depth(rng: &mut Pcg64, (width, height): (u32, u32)) -> (Image<f32>, TargetDepth) {
     let mut image = random_picture(rng, width, height);
     let mut target = TargetDepth { depths: Vec::new(), confidences: Vec::new() };
@@ -149,7 +141,7 @@ pub fn random_depth(rng: &mut Pcg64, (width, height): (u32, u32)) -> (Image<f32>
         let transmittance = rng.random::<f32>().powi(3);
         let alpha = 1.0 - transmittance;
         let z = unit * rng.random_range(0.5f32..2.0);
-        // Apart, where rounding does not turn the slope's sign, or equal to the bit.
+        // Far apart, so that rounding does not change the slope's sign.
         let apart = if rng.random::<f32>() < 0.5 { 0.7 } else { 1.2 };
         image.transmittance[k] = transmittance;
         image.alpha[k] = alpha;
@@ -186,21 +178,13 @@ pub fn depth_loss_matches_the_reference(stages: &dyn Stages<f32>) {
     assert!(error.starts_with("target: has depths"), "{error}");
 }
 
-/// Splats under optimisation, with moments of earlier steps, and gradients.
+/// Splats under optimization, with moments of earlier steps, and gradients.
 pub fn random_adam(
     rng: &mut Pcg64,
     n: usize,
     sh_degree: u32,
 ) -> (AdamState<f32>, SplatGradients<f32>) {
-    let scene = random_scene(rng, n, Some(sh_degree));
-    let splats = SplatArrays {
-        means: scene.means,
-        quats: scene.quats,
-        scales: scene.scales,
-        opacities: scene.opacities,
-        sh: scene.colors,
-        sh_degree,
-    };
+    let splats = random_scene(rng, n, Some(sh_degree)).arrays();
     let mut like = |scale: f64, square: bool| {
         let mut value = || {
             let v = scale * normal(rng);
@@ -231,14 +215,7 @@ pub fn random_adam(
 pub fn full_step(sh_degree: u32) -> AdamStep {
     AdamStep {
         number: 7,
-        rates: Rates {
-            means: 1e-3,
-            quats: 2e-3,
-            scales: 5e-3,
-            opacities: 5e-2,
-            sh0: 4e-3,
-            sh_rest: 2e-4,
-        },
+        rates: RATES,
         sh_degree,
         opacity_regularizer: 0.1,
         scale_regularizer: 0.1,
@@ -288,7 +265,7 @@ pub fn adam_matches_the_reference(stages: &dyn Stages<f32>) {
                 assert!(off <= ADAM, "{n} splats, SH {used} of {stored}: {what}, {kind} {off:.1e}");
             }
         }
-        // What is not in use rests, moments included.
+        // Unused coefficients and their moments do not change.
         let stride = splat_render::sh::coeffs(stored);
         let rests = |a: &SplatArrays, b: &SplatArrays| {
             (0..n).all(|i| {
@@ -301,7 +278,7 @@ pub fn adam_matches_the_reference(stages: &dyn Stages<f32>) {
     }
 }
 
-/// With all rates 0, neither parameters nor moments move, and there is no noise.
+/// With all rates 0, no parameter and no moment changes, and there is no noise.
 pub fn frozen_splats_keep_their_moments(stages: &dyn Stages<f32>) {
     let (mut state, gradients) = random_adam(&mut rng(80), 130, 2);
     state.splats.opacities.fill(-7.0);

@@ -1,0 +1,151 @@
+//! The kernels with their bindings, and the WGSL that they are compiled from.
+
+mod constants;
+mod table;
+#[cfg(test)]
+mod tests;
+
+use constants::constants;
+pub(super) use table::Kernel;
+
+use crate::constants::TILE;
+
+/// Declarations and functions at the start of every shader.
+const SHARED: &str = include_str!("../shaders/shared.wgsl");
+
+/// How a shader uses a binding.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Access {
+    Uniform,
+    Read,
+    Write,
+}
+
+/// Build parameters of the shaders for one kind of adapter.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Build {
+    /// Pixel rows per thread of the rasterize kernels; many on software adapters, which read slowly.
+    pub rows: u32,
+    /// Whether a tile's threads are one subgroup and share data through it.
+    pub subgroups: bool,
+    pub digit_bits: u32,
+    /// Whether each thread of the loss filters a whole row or column.
+    pub loss_by_lines: bool,
+    /// Workgroups per scan or sort: a few per core on a CPU, many on a GPU.
+    pub segments: u32,
+}
+
+impl Build {
+    /// For GPUs, and for software adapters with and without subgroups of a tile's threads.
+    pub const ALL: [Self; 3] = [
+        Self { rows: 2, subgroups: false, digit_bits: 8, loss_by_lines: false, segments: 256 },
+        Self { rows: 8, subgroups: true, digit_bits: 4, loss_by_lines: true, segments: 16 },
+        Self { rows: 8, subgroups: false, digit_bits: 4, loss_by_lines: true, segments: 16 },
+    ];
+
+    pub const fn threads(self) -> u32 {
+        TILE * TILE / 4 / self.rows
+    }
+}
+
+/// A WGSL source: its texts, and its bindings in the order of their numbers.
+#[derive(Debug)]
+pub(super) struct Source {
+    pub name: &'static str,
+    pub bindings: &'static [Access],
+    /// Texts after [`SHARED`].
+    parts: &'static [&'static str],
+    /// Text for cooperating threads of a tile: for any device, and for tiles that are subgroups.
+    tile_work: Option<[&'static str; 2]>,
+    /// Whether the source has the override `SEGMENTS`.
+    segmented: bool,
+}
+
+/// WGSL declarations such as `Splat2d`, for callers that draw from the kernels' buffers.
+pub fn shared_wgsl() -> String {
+    constants(1) + SHARED
+}
+
+/// Every source once.
+fn sources() -> impl Iterator<Item = &'static Source> {
+    let of_kernel = |i: usize| Kernel::ALL[i].source();
+    let is_first = move |&i: &usize| i == 0 || of_kernel(i - 1).name != of_kernel(i).name;
+    (0..Kernel::ALL.len()).filter(is_first).map(of_kernel)
+}
+
+/// A shader as one kind of adapter compiles it.
+#[derive(Debug, Clone)]
+pub struct ShaderVariant {
+    /// Source and build.
+    pub name: String,
+    /// The WGSL.
+    pub text: String,
+    /// Whether it needs subgroup operations.
+    pub subgroups: bool,
+    /// Values of its pipeline-overridable constants.
+    pub constants: Vec<(&'static str, f64)>,
+}
+
+/// Every shader in every variant, for tests that translate them to the drivers' languages.
+pub fn shader_variants() -> impl Iterator<Item = ShaderVariant> {
+    Build::ALL.into_iter().flat_map(|build| {
+        sources().map(move |source| ShaderVariant {
+            name: format!(
+                "{}, {} rows{}",
+                source.name,
+                build.rows,
+                if build.subgroups { ", subgroups" } else { "" }
+            ),
+            text: source.text(build),
+            subgroups: build.subgroups,
+            constants: source.constants(build),
+        })
+    })
+}
+
+/// Repeats every line that contains `{row}` once for each of `rows` rows.
+fn repeat_rows(text: &str, rows: u32) -> String {
+    let mut out = String::with_capacity(2 * text.len());
+    for line in text.split_inclusive('\n') {
+        if line.contains("{row}") && !line.trim_start().starts_with("//") {
+            (0..rows).for_each(|row| out.push_str(&line.replace("{row}", &row.to_string())));
+        } else {
+            out.push_str(line);
+        }
+    }
+    out
+}
+
+impl Source {
+    const fn new(
+        name: &'static str,
+        parts: &'static [&'static str],
+        bindings: &'static [Access],
+    ) -> Self {
+        Self { name, bindings, parts, tile_work: None, segmented: false }
+    }
+
+    const fn with_tile_work(self, texts: [&'static str; 2]) -> Self {
+        Self { tile_work: Some(texts), ..self }
+    }
+
+    const fn segmented(self) -> Self {
+        Self { segmented: true, ..self }
+    }
+
+    pub fn text(&self, build: Build) -> String {
+        let mut text = constants(build.rows);
+        if let Some(texts) = self.tile_work {
+            text.push_str(texts[usize::from(build.subgroups)]);
+        }
+        text.push_str(&repeat_rows(SHARED, build.rows));
+        for part in self.parts {
+            text.push_str(&repeat_rows(part, build.rows));
+        }
+        text
+    }
+
+    pub fn constants(&self, build: Build) -> Vec<(&'static str, f64)> {
+        if self.segmented { vec![("SEGMENTS", f64::from(build.segments))] } else { Vec::new() }
+    }
+}
