@@ -8,8 +8,8 @@ from math import prod
 import torch
 from dust3r_networks import hashed
 
-from igsr.pose.da3.backbone import NetworkConfig
-from igsr.pose.da3.network import Da3Network
+from igsr.cameras.da3.backbone import NetworkConfig
+from igsr.cameras.da3.network import Da3Network
 
 #: Twelve blocks as in the published sizes, with few channels.
 TINY = NetworkConfig(embed_dim=32, heads=2, features=16, out_channels=(8, 12, 16, 24))

@@ -1,7 +1,7 @@
 """A slow implementation of Depth Anything 3 in float64 and numpy, to compare the network with.
 
-It follows the description of the network, not ``igsr.pose.da3``: matrix products instead of fused
-kernels, sums over shifted images instead of convolutions, complex numbers instead of rotated pairs.
+It follows the description of the network, not ``igsr.cameras.da3``: matrix products, not fused
+kernels, sums over shifted images, not convolutions, complex numbers, not rotated pairs.
 """
 
 from __future__ import annotations

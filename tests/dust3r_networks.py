@@ -8,7 +8,7 @@ from math import prod
 import numpy as np
 import torch
 
-from igsr.pose.dust3r.network import Dust3rNetwork, NetworkConfig
+from igsr.cameras.dust3r.network import Dust3rNetwork, NetworkConfig
 
 # Heads of 32 and of 24 channels: other sizes of the rotary halves than the published 64.
 TINY = NetworkConfig(

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from igsr.cameras.alignment import PairPrediction, PhotoToAlign
+from igsr.cameras.grid import Grid
 from igsr.capture import Camera
-from igsr.pose.alignment import PairPrediction, PhotoToAlign
-from igsr.pose.grid import Grid
 
 CONFIDENCE = 8.0
 

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from pointmaps import CONFIDENCE, PointmapScene, all_pairs
 
+from igsr.cameras.alignment import AlignedPhoto, align
+from igsr.cameras.alignment import predictions as predictions_module
+from igsr.cameras.alignment.camera_solvers import searched_focal, weiszfeld_focal
+from igsr.cameras.alignment.initial_alignment import components, spanning_tree, start
+from igsr.cameras.alignment.objective import Objective
+from igsr.cameras.alignment.predictions import observe, overlapping_edges
+from igsr.cameras.depth_maps import trusted_pixels
+from igsr.cameras.grid import Grid
 from igsr.errors import IgsrError
 from igsr.geometry.pose_errors import pose_errors
 from igsr.geometry.similarity import Similarity, similarity_between, similarity_of_points
-from igsr.pose.alignment import AlignedPhoto, align
-from igsr.pose.alignment import predictions as predictions_module
-from igsr.pose.alignment.camera_solvers import searched_focal, weiszfeld_focal
-from igsr.pose.alignment.initial_alignment import components, spanning_tree, start
-from igsr.pose.alignment.objective import Objective
-from igsr.pose.alignment.predictions import observe, overlapping_edges
-from igsr.pose.depth_maps import trusted_pixels
-from igsr.pose.grid import Grid
 
 
 def depth_noise(part, seed=0):

@@ -11,20 +11,20 @@ import rooms
 from scenes import perturbed_camera
 
 from igsr._internal.part_usage import Usage
+from igsr.cameras import all_evidence
+from igsr.cameras.alignment import AlignedPhoto
+from igsr.cameras.all_evidence import with_all_evidence
+from igsr.cameras.cameras_file import KeptCameras, read_cameras_file, write_cameras_file
+from igsr.cameras.colmap import Colmap
+from igsr.cameras.da3.estimator import Da3
+from igsr.cameras.da3.prediction import resampling_of
+from igsr.cameras.found_cameras import FoundCameras
 from igsr.capture.types import PoseEvidence
 from igsr.capture.write_transforms import write_cameras
 from igsr.errors import IgsrError
 from igsr.fitting.pose_priors import pose_priors
 from igsr.geometry.pose_errors import pose_accuracy, pose_errors
 from igsr.geometry.similarity import similarity_between
-from igsr.pose import all_evidence
-from igsr.pose.alignment import AlignedPhoto
-from igsr.pose.all_evidence import with_all_evidence
-from igsr.pose.cameras_file import KeptCameras, read_cameras_file, write_cameras_file
-from igsr.pose.colmap import Colmap
-from igsr.pose.da3.estimator import Da3
-from igsr.pose.da3.prediction import resampling_of
-from igsr.pose.found_cameras import FoundCameras
 
 COUNT = 5
 

@@ -10,6 +10,7 @@ import pytest
 import scenes
 from PIL import Image
 
+from igsr.cameras.colmap.estimator import camera_seconds
 from igsr.capture.load import Overview, look_at
 from igsr.fitting import announcement, settings_for
 from igsr.fitting.time_estimate import (
@@ -21,7 +22,6 @@ from igsr.fitting.time_estimate import (
     timed_steps,
     work_done,
 )
-from igsr.pose.colmap.estimator import camera_seconds
 
 #: A step that takes a microsecond per pixel.
 PER_PIXEL = StepTime(0.0, 1e-6, 0.0)

@@ -10,12 +10,12 @@ import scenes
 from PIL import Image
 
 import igsr
+from igsr.cameras import registry
+from igsr.cameras.cameras_file import read_cameras_file
+from igsr.cameras.estimate import Estimate
 from igsr.capture import memory_check
 from igsr.capture.undistort import Lens
 from igsr.geometry.pose_errors import pose_accuracy
-from igsr.pose import registry
-from igsr.pose.cameras_file import read_cameras_file
-from igsr.pose.estimate import Estimate
 
 MADE = scenes.capture(views=6, size=40)
 FIT = ["--steps", "30", "--max-splats", "200", "--sh-degree", "0", "--backend", "cpu", "--json"]

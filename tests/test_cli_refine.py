@@ -8,9 +8,9 @@ import pytest
 import scenes
 
 import igsr
+from igsr.cameras import registry
 from igsr.denoiser import save_network
 from igsr.denoiser.network import Architecture, DenoiserNetwork
-from igsr.pose import registry
 
 
 def test_refine_writes_its_folder_and_resumes(few_photos, tmp_path, igsr_here):

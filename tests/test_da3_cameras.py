@@ -7,7 +7,7 @@ import pytest
 import torch
 from scenes import ring_camera
 
-from igsr.pose.da3.cameras import decode_pose, encode_pose, normalized_viewmats
+from igsr.cameras.da3.cameras import decode_pose, encode_pose, normalized_viewmats
 
 HEIGHT, WIDTH = 42, 70
 SIZES = [(HEIGHT, WIDTH)]

@@ -9,15 +9,15 @@ import torch
 from da3_networks import TINY, hashed_network, hashed_weight
 from safetensors.torch import save_file
 
-from igsr.errors import IgsrError
-from igsr.pose.checkpoint_search import find_checkpoint
-from igsr.pose.da3.backbone import BASE, SMALL
-from igsr.pose.da3.checkpoint import (
+from igsr.cameras.checkpoint_search import find_checkpoint
+from igsr.cameras.da3.backbone import BASE, SMALL
+from igsr.cameras.da3.checkpoint import (
     SIZES,
     load_checkpoint,
     load_network,
     size_of,
 )
+from igsr.errors import IgsrError
 
 NORM = "model.head.scratch.output_conv2_aux.{}.2.{}"
 

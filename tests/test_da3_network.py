@@ -8,10 +8,10 @@ import torch
 from da3_networks import TINY, hashed_network, hashed_pixels
 from da3_slow import SlowDa3
 
-from igsr.pose.da3.backbone import BASE, SMALL, reference_view
-from igsr.pose.da3.cameras import encode_pose, normalized_viewmats
-from igsr.pose.da3.network import Da3Network
-from igsr.pose.networks import rotary_tables, rotated
+from igsr.cameras.da3.backbone import BASE, SMALL, reference_view
+from igsr.cameras.da3.cameras import encode_pose, normalized_viewmats
+from igsr.cameras.da3.network import Da3Network
+from igsr.cameras.networks import rotary_tables, rotated
 
 FIELDS = ("depth", "confidence", "rays", "ray_confidence", "pose_encoding")
 #: The float32 network reached 2e-6 of the largest value; half precision is off by 1e-3.
@@ -148,7 +148,7 @@ def test_the_reference_view_is_the_most_average_one():
 def test_the_reference_is_chosen_from_three_views_on(network, monkeypatch, count, chosen):
     seen = []
     monkeypatch.setattr(
-        "igsr.pose.da3.backbone.reference_view", lambda tokens: seen.append(tokens.shape) or 1
+        "igsr.cameras.da3.backbone.reference_view", lambda tokens: seen.append(tokens.shape) or 1
     )
     network.predict(list(hashed_pixels("choice", count, 28, 28)), rays=False)
     assert seen == [(count, TINY.embed_dim)] * chosen

@@ -7,9 +7,7 @@ import pytest
 import torch
 from torch.nn.functional import interpolate
 
-from igsr.capture.photo_folder import Photo
-from igsr.errors import IgsrError
-from igsr.pose.da3.prediction import (
+from igsr.cameras.da3.prediction import (
     DEVIATION,
     MEAN,
     area_matrix,
@@ -19,6 +17,8 @@ from igsr.pose.da3.prediction import (
     resampling_of,
     resamplings_of,
 )
+from igsr.capture.photo_folder import Photo
+from igsr.errors import IgsrError
 
 
 @pytest.mark.parametrize(("size", "wanted"), [(12, 4), (10, 7), (97, 31), (8, 8)])

@@ -16,11 +16,11 @@ from da3_networks import hashed_network
 from PIL import Image
 from safetensors import safe_open
 
-from igsr.pose.da3.backbone import SMALL, NetworkConfig
-from igsr.pose.da3.cameras import decode_pose, encode_pose, normalized_viewmats
-from igsr.pose.da3.checkpoint import read_weights
-from igsr.pose.da3.network import Da3Network
-from igsr.pose.da3.prediction import network_input, resampled, resampling_of
+from igsr.cameras.da3.backbone import SMALL, NetworkConfig
+from igsr.cameras.da3.cameras import decode_pose, encode_pose, normalized_viewmats
+from igsr.cameras.da3.checkpoint import read_weights
+from igsr.cameras.da3.network import Da3Network
+from igsr.cameras.da3.prediction import network_input, resampled, resampling_of
 
 FOLDER = Path(os.environ["IGSR_DA3_FIXTURES"])
 

@@ -14,23 +14,23 @@ from safetensors.torch import save_file
 from scenes import ring_camera
 
 from igsr._internal.part_usage import Usage
+from igsr.cameras import CameraSettings
+from igsr.cameras.alignment import AlignedPhoto
+from igsr.cameras.cameras_file import KeptCameras, read_cameras_file, write_cameras_file
+from igsr.cameras.da3 import prediction
+from igsr.cameras.da3.backbone import BASE
+from igsr.cameras.da3.checkpoint import SIZES
+from igsr.cameras.da3.estimator import Da3, with_shared_focals
+from igsr.cameras.da3.passes import joined_passes, passes_of
+from igsr.cameras.da3.prediction import Da3Predictor, memory_of_pass, resampling_of
+from igsr.cameras.depth_maps import trusted_depths
+from igsr.cameras.find import estimate
+from igsr.cameras.found_cameras import FoundCameras
 from igsr.capture import Camera
 from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
 from igsr.geometry.pose_errors import pose_errors
 from igsr.geometry.similarity import Similarity, similarity_between
-from igsr.pose import CameraSettings
-from igsr.pose.alignment import AlignedPhoto
-from igsr.pose.cameras_file import KeptCameras, read_cameras_file, write_cameras_file
-from igsr.pose.da3 import prediction
-from igsr.pose.da3.backbone import BASE
-from igsr.pose.da3.checkpoint import SIZES
-from igsr.pose.da3.estimator import Da3, with_shared_focals
-from igsr.pose.da3.passes import joined_passes, passes_of
-from igsr.pose.da3.prediction import Da3Predictor, memory_of_pass, resampling_of
-from igsr.pose.depth_maps import trusted_depths
-from igsr.pose.find import estimate
-from igsr.pose.found_cameras import FoundCameras
 
 SIZE = 64
 

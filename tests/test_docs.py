@@ -33,8 +33,8 @@ from PIL import Image
 from typer.main import get_command
 
 import igsr
+from igsr.cameras.colmap import Colmap
 from igsr.cli import app
-from igsr.pose.colmap import Colmap
 from igsr_lab import __main__ as lab
 
 #: How many blocks of a page are not run. A further one is a decision, not an accident.

@@ -14,10 +14,10 @@ import torch
 from dust3r_networks import SMALL, empty_network, hashed_image, hashed_network
 from safetensors.torch import save_file
 
-import igsr.pose.dust3r.checkpoint
+import igsr.cameras.dust3r.checkpoint
+from igsr.cameras.checkpoint_search import find_checkpoint
+from igsr.cameras.dust3r.checkpoint import load_checkpoint, load_network
 from igsr.errors import IgsrError
-from igsr.pose.checkpoint_search import find_checkpoint
-from igsr.pose.dust3r.checkpoint import load_checkpoint, load_network
 
 
 def call_of(config, **changes):
@@ -157,7 +157,7 @@ def test_unknown_keys_are_listed(tmp_path):
 
 
 def test_the_license_is_shown_once(tmp_path, monkeypatch):
-    monkeypatch.setattr(igsr.pose.dust3r.checkpoint, "_license_shown", False)
+    monkeypatch.setattr(igsr.cameras.dust3r.checkpoint, "_license_shown", False)
     path = saved(tmp_path / "a.pth")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

@@ -10,9 +10,9 @@ import pytest
 import torch
 from dust3r_networks import TINY, empty_network, hashed_image, hashed_network, hashed_weight
 
+from igsr.cameras.dust3r.network import NetworkConfig, Tokens
+from igsr.cameras.networks import rotary_tables, rotated
 from igsr.errors import IgsrError
-from igsr.pose.dust3r.network import NetworkConfig, Tokens
-from igsr.pose.networks import rotary_tables, rotated
 
 DPT_512 = NetworkConfig()
 LINEAR_224 = NetworkConfig(image_size=224, head="linear")

@@ -10,17 +10,17 @@ import pytest
 import torch
 from dust3r_networks import SMALL, hashed_network
 
-from igsr.capture.photo_folder import Photo
-from igsr.errors import IgsrError
-from igsr.pose.dust3r import prediction
-from igsr.pose.dust3r.estimator import MAX_COMPLETE_PHOTOS, default_graph, pair_graph
-from igsr.pose.dust3r.prediction import (
+from igsr.cameras.dust3r import prediction
+from igsr.cameras.dust3r.estimator import MAX_COMPLETE_PHOTOS, default_graph, pair_graph
+from igsr.cameras.dust3r.prediction import (
     DustPredictor,
     crop_of,
     grid_samples,
     network_input,
     stride_for,
 )
+from igsr.capture.photo_folder import Photo
+from igsr.errors import IgsrError
 
 
 def photo(width, height, name="a.jpg", seed=0, mask=None, channels=3):

@@ -11,16 +11,16 @@ from dust3r_networks import SMALL, hashed_network
 from PIL import Image
 from scenes import ring_camera, splats
 
+from igsr.cameras import depth_maps, registry
+from igsr.cameras.alignment import AlignedPhoto, PairPrediction
+from igsr.cameras.dust3r.estimator import Dust3r, with_dense_depth
+from igsr.cameras.dust3r.prediction import DenseGrid, DenseMap, DustPredictor
+from igsr.cameras.grid import Grid
 from igsr.capture import Camera, load_capture
 from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
 from igsr.geometry.pose_errors import pose_errors
 from igsr.geometry.similarity import similarity_between
-from igsr.pose import depth_maps, registry
-from igsr.pose.alignment import AlignedPhoto, PairPrediction
-from igsr.pose.dust3r.estimator import Dust3r, with_dense_depth
-from igsr.pose.dust3r.prediction import DenseGrid, DenseMap, DustPredictor
-from igsr.pose.grid import Grid
 from igsr.rendering.renders import render
 
 COUNT, SIZE, STEP = 4, 48, 2

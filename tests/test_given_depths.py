@@ -12,16 +12,16 @@ import scenes
 
 import igsr
 from igsr._internal.part_usage import Usage
+from igsr.cameras.cameras_file import KeptCameras, read_cameras_file, write_cameras_file
+from igsr.cameras.estimate import Estimate
+from igsr.cameras.found_cameras import FoundCameras
+from igsr.cameras.grid import Grid
 from igsr.capture import Capture, Points, View
 from igsr.capture.photo_folder import Photo
 from igsr.capture.types import Tracks
 from igsr.fitting.depth_checks import with_consistent_depths, with_scaled_depths
 from igsr.fitting.initialization.given_depths import given_points, have_depths
 from igsr.fitting.initialization.initial_splats import chosen_start, initial_splats
-from igsr.pose.cameras_file import KeptCameras, read_cameras_file, write_cameras_file
-from igsr.pose.estimate import Estimate
-from igsr.pose.found_cameras import FoundCameras
-from igsr.pose.grid import Grid
 from igsr.rendering.renders import render
 
 

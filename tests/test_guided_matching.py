@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from igsr.pose.colmap import guided_matching
-from igsr.pose.colmap.guided_matching import EpipolarLine, Plane, comparable, guided_matches
+from igsr.cameras.colmap import guided_matching
+from igsr.cameras.colmap.guided_matching import EpipolarLine, Plane, comparable, guided_matches
 
 H = np.array([[0.9, 0.1, 20.0], [-0.1, 1.0, 5.0], [1e-4, 0.0, 1.0]])
 

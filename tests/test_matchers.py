@@ -9,12 +9,12 @@ import pytest
 import rooms
 
 import igsr
+from igsr.cameras.colmap import Colmap
+from igsr.cameras.colmap.matcher import PhotoFeatures
+from igsr.cameras.find import CameraSettings
 from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
 from igsr.geometry.pose_errors import pose_accuracy
-from igsr.pose.colmap import Colmap
-from igsr.pose.colmap.matcher import PhotoFeatures
-from igsr.pose.find import CameraSettings
 
 #: Their photos are noise: only the matcher's matches determine the cameras.
 CAMERAS = [rooms.camera(angle) for angle in np.linspace(-1.0, 1.0, 5)]

@@ -15,14 +15,14 @@ from PIL import Image, ImageFile
 
 import igsr
 from igsr._internal.part_usage import Meter, Usage
+from igsr.cameras import registry
+from igsr.cameras.cameras_file import read_cameras_file
+from igsr.cameras.estimate import Estimate
 from igsr.capture.image_files import SUFFIXES
 from igsr.denoiser import save_network
 from igsr.denoiser.network import Architecture, DenoiserNetwork
 from igsr.fitting import train
 from igsr.fitting.photo_statistics import MAX_DETAIL_FILES
-from igsr.pose import registry
-from igsr.pose.cameras_file import read_cameras_file
-from igsr.pose.estimate import Estimate
 from igsr.refinement import round_denoiser
 
 MADE = scenes.capture(views=6, size=40)

@@ -11,15 +11,20 @@ import numpy as np
 import pytest
 import rooms
 
+from igsr.cameras.colmap import attempts
+from igsr.cameras.colmap.attempts import THRESHOLDS, Mapped, mapped
+from igsr.cameras.colmap.database import image_id, list_photos
+from igsr.cameras.colmap.estimator import guarded
+from igsr.cameras.colmap.features import find_features
+from igsr.cameras.colmap.mapping import extend, map_photos
+from igsr.cameras.colmap.matching import (
+    matched,
+    matched_along_lines,
+    with_focal_lengths,
+    with_matches,
+)
+from igsr.cameras.colmap.result import estimate_of
 from igsr.geometry.pose_errors import pose_accuracy
-from igsr.pose.colmap import attempts
-from igsr.pose.colmap.attempts import THRESHOLDS, Mapped, mapped
-from igsr.pose.colmap.database import image_id, list_photos
-from igsr.pose.colmap.estimator import guarded
-from igsr.pose.colmap.features import find_features
-from igsr.pose.colmap.mapping import extend, map_photos
-from igsr.pose.colmap.matching import matched, matched_along_lines, with_focal_lengths, with_matches
-from igsr.pose.colmap.result import estimate_of
 
 CAMERAS = [rooms.camera(angle) for angle in np.linspace(-0.4, 0.4, 5)]
 

@@ -17,17 +17,17 @@ from made_up_tracks import projected
 from PIL import Image
 
 import igsr
+from igsr.cameras import registry
+from igsr.cameras.colmap import Colmap, estimator, features, pairs
+from igsr.cameras.colmap.attempts import Mapped
+from igsr.cameras.colmap.database import list_photos
+from igsr.cameras.colmap.features import find_features
+from igsr.cameras.estimate import Estimate
 from igsr.capture import Camera, Capture, View
 from igsr.capture.photo_folder import Photo
 from igsr.capture.write_transforms import write_transforms
 from igsr.geometry.pose_errors import pose_accuracy
 from igsr.geometry.similarity import Similarity, similarity_between
-from igsr.pose import registry
-from igsr.pose.colmap import Colmap, estimator, features, pairs
-from igsr.pose.colmap.attempts import Mapped
-from igsr.pose.colmap.database import list_photos
-from igsr.pose.colmap.features import find_features
-from igsr.pose.estimate import Estimate
 
 CAMERAS = [rooms.camera(angle) for angle in np.linspace(-0.5, 0.5, 6)]
 

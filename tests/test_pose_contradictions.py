@@ -11,22 +11,22 @@ import numpy as np
 import pytest
 import rooms
 
-from igsr.capture.photo_folder import Photo
-from igsr.geometry.pose_errors import pose_accuracy
-from igsr.pose.colmap.attempts import THRESHOLDS, mapped
-from igsr.pose.colmap.contradictions import (
+from igsr.cameras.colmap.attempts import THRESHOLDS, mapped
+from igsr.cameras.colmap.contradictions import (
     contradictions,
     leave_out,
     links,
     links_between_parts,
     parts,
 )
-from igsr.pose.colmap.database import list_photos
-from igsr.pose.colmap.estimator import guarded
-from igsr.pose.colmap.features import find_features
-from igsr.pose.colmap.mapping import map_photos
-from igsr.pose.colmap.matching import matched, with_focal_lengths
-from igsr.pose.colmap.result import estimate_of
+from igsr.cameras.colmap.database import list_photos
+from igsr.cameras.colmap.estimator import guarded
+from igsr.cameras.colmap.features import find_features
+from igsr.cameras.colmap.mapping import map_photos
+from igsr.cameras.colmap.matching import matched, with_focal_lengths
+from igsr.cameras.colmap.result import estimate_of
+from igsr.capture.photo_folder import Photo
+from igsr.geometry.pose_errors import pose_accuracy
 
 
 class Image:

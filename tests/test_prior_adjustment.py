@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 from scenes import perturbed_camera, ring_camera
 
-from igsr.geometry.bundle_equations import Equations
-from igsr.geometry.pose_errors import pose_accuracy, pose_errors
-from igsr.pose.colmap.adjustment import deviations
-from igsr.pose.prior_adjustment import (
+from igsr.cameras.colmap.adjustment import deviations
+from igsr.cameras.prior_adjustment import (
     Bundle,
     Observations,
     Spread,
@@ -20,6 +18,8 @@ from igsr.pose.prior_adjustment import (
     adjusted_bundle,
     covariances,
 )
+from igsr.geometry.bundle_equations import Equations
+from igsr.geometry.pose_errors import pose_accuracy, pose_errors
 
 COUNT = 5
 SPREAD = Spread(np.radians(1.5), 0.1)

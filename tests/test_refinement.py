@@ -10,10 +10,10 @@ import pytest
 from refinements import contented, lying, refine, same, truthful, unsure
 
 import igsr
+from igsr.cameras import find
 from igsr.fitting import presets
 from igsr.fitting.photo_statistics import photo_statistics
 from igsr.fitting.presets import settings_for
-from igsr.pose import find
 from igsr.refinement import cross_validation, rounds
 from igsr.refinement.cross_validation import combined_error, fold_photos
 from igsr.refinement.results import Stop, StopReason

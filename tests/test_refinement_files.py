@@ -13,9 +13,9 @@ from PIL import Image
 from refinements import refine, same, truthful, unsure
 
 import igsr
+from igsr.cameras import registry
+from igsr.cameras.estimate import Estimate
 from igsr.fitting import followed_run
-from igsr.pose import registry
-from igsr.pose.estimate import Estimate
 from igsr.refinement.report import seconds_so_far
 from igsr.refinement.results import StopReason
 

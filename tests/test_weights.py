@@ -12,10 +12,10 @@ import warnings
 import pytest
 from huggingface_hub import file_download as download
 
+from igsr.cameras import weights as module
+from igsr.cameras.checkpoint_search import find_checkpoint
+from igsr.cameras.weights import KNOWN, fetch_weights, known_weights, weights_path
 from igsr.errors import IgsrError
-from igsr.pose import weights as module
-from igsr.pose.checkpoint_search import find_checkpoint
-from igsr.pose.weights import KNOWN, fetch_weights, known_weights, weights_path
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 CONTENT = {

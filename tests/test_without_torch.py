@@ -17,12 +17,12 @@ from igsr.errors import MissingExtraError
 #: Packages and modules that may need torch.
 OF_REFINE = (
     "igsr.denoiser",
-    "igsr.pose.alignment",
-    "igsr.pose.all_evidence",
-    "igsr.pose.colmap.adjustment",
-    "igsr.pose.da3",
-    "igsr.pose.dust3r",
-    "igsr.pose.networks",
+    "igsr.cameras.alignment",
+    "igsr.cameras.all_evidence",
+    "igsr.cameras.colmap.adjustment",
+    "igsr.cameras.da3",
+    "igsr.cameras.dust3r",
+    "igsr.cameras.networks",
     "igsr.refinement",
     "igsr.rendering.exposure",
     "igsr.rendering.normals",

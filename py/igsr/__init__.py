@@ -17,6 +17,7 @@ from igsr._internal.lazy_exports import lazy_exports
 
 if TYPE_CHECKING:
     from igsr._core import __version__
+    from igsr.cameras import find_cameras
     from igsr.capture import (
         Camera,
         Capture,
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
     from igsr.evaluation import Scores, evaluate
     from igsr.fitting import FitResult, fit, refine_cameras
     from igsr.floaters import remove_floaters
-    from igsr.pose import find_cameras
     from igsr.refinement import Refined, refine
     from igsr.rendering import Render, render
     from igsr.rendering.exposure import apply_exposure
@@ -91,7 +91,7 @@ if not TYPE_CHECKING:
             "igsr.evaluation": ("Scores", "evaluate"),
             "igsr.fitting": ("FitResult", "fit", "refine_cameras"),
             "igsr.floaters": ("remove_floaters",),
-            "igsr.pose": ("find_cameras",),
+            "igsr.cameras": ("find_cameras",),
             "igsr.refinement": ("Refined", "refine"),
             "igsr.rendering": ("Render", "render"),
             "igsr.rendering.exposure": ("apply_exposure",),

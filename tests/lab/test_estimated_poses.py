@@ -10,8 +10,8 @@ import pytest
 import scenes
 from PIL import Image
 
-from igsr.pose import registry
-from igsr.pose.estimate import Estimate
+from igsr.cameras import registry
+from igsr.cameras.estimate import Estimate
 
 
 @pytest.fixture

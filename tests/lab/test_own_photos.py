@@ -12,9 +12,9 @@ from feature_files import squeezenet_file
 from PIL import Image
 
 import igsr
+from igsr.cameras import find
+from igsr.cameras.estimate import Estimate
 from igsr.capture import Capture
-from igsr.pose import find
-from igsr.pose.estimate import Estimate
 from igsr_lab.study import Study, own_photos, own_photos_study
 from igsr_lab.study.own_photos_report import differences
 from igsr_lab.study.own_photos_study import photo_scenes

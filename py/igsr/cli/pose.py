@@ -63,7 +63,7 @@ def pose_command(
                 "them again"
             )
         options = estimator_options(checkpoint) | ({} if graph is None else {"graph": graph})
-        from igsr.pose.find import CameraSettings
+        from igsr.cameras.find import CameraSettings
 
         settings = CameraSettings(estimator, options, seed, frames)
         with progress_bar(shown=not as_json) as show:
@@ -88,10 +88,10 @@ def _posed(
     progress: Any,
 ) -> dict[str, Any]:
     """Find cameras, write the capture, and return the report."""
+    from igsr.cameras.find import estimated_cameras, photos_at
+    from igsr.cameras.plot_poses import plot_poses
     from igsr.capture.downscaling import check_max_size
     from igsr.capture.write_colmap import write_colmap
-    from igsr.pose.find import estimated_cameras, photos_at
-    from igsr.pose.plot_poses import plot_poses
 
     check_max_size(max_size)
     started = time.monotonic()

@@ -6,10 +6,10 @@ from typing import Annotated
 
 import typer
 
+from igsr.cameras.weights import KNOWN, cache_folder, fetch_weights, known_weights, weights_path
 from igsr.cli.error_messages import error_messages, print_message
 from igsr.cli.options import JsonOption
 from igsr.cli.output import output_console, print_json
-from igsr.pose.weights import KNOWN, cache_folder, fetch_weights, known_weights, weights_path
 
 app = typer.Typer(
     help="List, download and locate the weights of pose networks.", no_args_is_help=True

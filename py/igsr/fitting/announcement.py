@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from igsr.cameras.colmap.estimator import camera_seconds
 from igsr.capture.downscaling import reduced_size
 from igsr.capture.load import Overview
 from igsr.evaluation.quick_scores import MAX_TRAIN_PHOTOS
 from igsr.fitting.photo_statistics import PhotoStatistics, detail_of_files
 from igsr.fitting.presets import Quality, settings_for
 from igsr.fitting.time_estimate import fit_seconds, other_seconds, slowdown, timed_steps
-from igsr.pose.colmap.estimator import camera_seconds
 
 #: Angle between neighboring photos before cameras are known.
 ASSUMED_SPACING_DEG = 10.0

@@ -13,6 +13,7 @@ from igsr import _core
 from igsr._internal.choices import FitBackend
 from igsr._internal.event import Listener
 from igsr._internal.settings import checked_given
+from igsr.cameras import AUTO, CameraSettings, load_photos
 from igsr.capture import Capture
 from igsr.capture.load import Overview
 from igsr.capture.photo_folder import FRAMES
@@ -35,7 +36,6 @@ from igsr.fitting.settings import (
     Poses,
     TransientMode,
 )
-from igsr.pose import AUTO, CameraSettings, load_photos
 from igsr.run import Run, open_run
 from igsr.splats import Splats
 

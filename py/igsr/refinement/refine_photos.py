@@ -19,6 +19,8 @@ from typing import Any
 from igsr._internal.atomic_write import remove_unfinished
 from igsr._internal.choices import FitBackend
 from igsr._internal.event import Listener
+from igsr.cameras import AUTO as AUTO_ESTIMATOR
+from igsr.cameras import CameraSettings, load_photos
 from igsr.capture import Capture
 from igsr.capture.load import Overview
 from igsr.capture.photo_checks import check_photos
@@ -32,8 +34,6 @@ from igsr.fitting.followed_run import FollowedRun
 from igsr.fitting.photo_statistics import photo_statistics
 from igsr.fitting.presets import Quality, default_max_size
 from igsr.fitting.settings import ExposureMode, TransientMode
-from igsr.pose import AUTO as AUTO_ESTIMATOR
-from igsr.pose import CameraSettings, load_photos
 from igsr.refinement import rounds as steps_of_rounds
 from igsr.refinement.cross_validation import (
     MIN_PHOTOS,

@@ -15,15 +15,15 @@ from pathlib import Path
 
 import numpy as np
 
+from igsr.cameras import all_evidence
+from igsr.cameras.colmap import Colmap
+from igsr.cameras.da3.estimator import Da3
+from igsr.cameras.estimate import Estimate
 from igsr.capture import Camera, load_capture
 from igsr.capture.downscaling import resized_camera
 from igsr.capture.photo_folder import Photo, reduced_photo
 from igsr.geometry.pose_errors import pose_accuracy
 from igsr.geometry.similarity import similarity_between
-from igsr.pose import all_evidence
-from igsr.pose.colmap import Colmap
-from igsr.pose.da3.estimator import Da3
-from igsr.pose.estimate import Estimate
 from igsr_lab.cameras.noisy_network import NoisyNetwork
 
 #: Reduction of depth maps from COLMAP's points.

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from igsr.cameras.alignment import AlignedPhoto
+from igsr.cameras.da3.preprocessing import resampling_of
 from igsr.capture import Camera
 from igsr.capture.photo_folder import Photo
 from igsr.geometry.similarity import Similarity
-from igsr.pose.alignment import AlignedPhoto
-from igsr.pose.da3.preprocessing import resampling_of
 
 Float64 = npt.NDArray[np.float64]
 
@@ -34,7 +34,7 @@ class Noise:
 
 
 class NoisyNetwork:
-    """A predictor (``igsr.pose.da3.passes.Predictor``).
+    """A predictor (``igsr.cameras.da3.passes.Predictor``).
 
     Args:
         cameras: true cameras by photo name.

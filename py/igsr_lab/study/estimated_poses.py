@@ -6,12 +6,12 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from igsr.cameras.registry import ESTIMATORS
 from igsr.capture import Camera, load_capture
 from igsr.capture.load import holds_cameras
 from igsr.capture.photo_folder import Photo, load_photos
 from igsr.errors import IgsrError
 from igsr.geometry.pose_errors import pose_accuracy
-from igsr.pose.registry import ESTIMATORS
 from igsr_lab.report_parts import cell, markdown_table
 from igsr_lab.resumable_jobs import Run
 from igsr_lab.study.study import Row, Study
@@ -62,7 +62,7 @@ def poses(study: Study, *, scenes: tuple[str, ...] = SCENES, estimator: str = "c
         study: its data has captures, whose cameras are hidden, or folders of photos, of which only
             the number of placed photos is reported.
         scenes: names of folders in the data.
-        estimator: a name of ``igsr.pose.registry.ESTIMATORS``.
+        estimator: a name of ``igsr.cameras.registry.ESTIMATORS``.
 
     Returns:
         The content of ``study.json``: "runs", a row per scene and seed (see

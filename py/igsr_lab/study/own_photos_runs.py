@@ -11,6 +11,10 @@ import numpy as np
 from igsr._internal.atomic_write import atomic_write
 from igsr._internal.choices import FitBackend
 from igsr._internal.part_usage import Meter, Parts
+from igsr.cameras import CameraSettings
+from igsr.cameras.cameras_file import KeptCameras, read_cameras_file, write_cameras_file
+from igsr.cameras.find import estimated_cameras, photos_at
+from igsr.cameras.load import check_enough_placed
 from igsr.capture import Camera, Capture, View, load_capture
 from igsr.capture.downscaling import resized_camera
 from igsr.capture.photo_folder import FRAMES, photo_sizes
@@ -21,10 +25,6 @@ from igsr.evaluation.quick_scores import quick_views, train_photos
 from igsr.evaluation.scores import METRICS, ScoredView, default_background, score_views
 from igsr.fitting.fit_capture import fit_capture
 from igsr.fitting.pose_refinement import refine_cameras
-from igsr.pose import CameraSettings
-from igsr.pose.cameras_file import KeptCameras, read_cameras_file, write_cameras_file
-from igsr.pose.find import estimated_cameras, photos_at
-from igsr.pose.load import check_enough_placed
 from igsr.splats import Splats
 from igsr_lab.denoiser.perceptual_distance import SqueezeNetDistance
 from igsr_lab.presets import Preset, preset_keywords

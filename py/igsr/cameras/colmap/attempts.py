@@ -1,0 +1,161 @@
+"""Place as many photos as possible with COLMAP's mapper, with falling thresholds.
+
+If COLMAP's own thresholds leave out few photos, more matches are searched for these, and the model
+is extended. If they leave out many, more matches are searched for all pairs, and mapping starts
+over. A model that contradicts its photos is mapped again without the wrong matches
+(``contradictions``).
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from igsr.cameras.colmap.contradictions import (
+    Pair,
+    contradictions,
+    leave_out,
+    links,
+    links_between_parts,
+    parts,
+)
+from igsr.cameras.colmap.database import image_id
+from igsr.cameras.colmap.mapping import Thresholds, extend, map_photos
+from igsr.cameras.colmap.matching import matched_along_lines, with_focal_lengths
+from igsr.cameras.estimate import Progress
+
+#: COLMAP's thresholds first, then lower ones.
+THRESHOLDS = (
+    Thresholds(100, 16.0, 30, 1.5, True, False),
+    Thresholds(100, 16.0, 30, 1.5, False, False),
+    Thresholds(100, 16.0, 30, 1.5, False, True),
+    Thresholds(40, 6.0, 15, 1.0, False, True),
+    Thresholds(15, 2.0, 10, 0.5, False, True),
+)
+#: Models by these thresholds and later ones may be wrong.
+FIRST_DOUBTFUL = 3
+#: Maximum number of photos for retries.
+MAX_RETRY_PHOTOS = 60
+#: Maximum fraction of missing photos to extend a model instead of mapping again.
+MAX_MISSING_FRACTION = 0.25
+#: Maximum number of times that matches are left out for one model.
+MAX_REMAPPINGS = 4
+
+
+@dataclass(frozen=True)
+class Mapped:
+    """The model with most photos.
+
+    Attributes:
+        model: pycolmap's reconstruction, or None if no two photos can be placed.
+        doubtful: whether its thresholds were so low that it may be wrong.
+        removed_pairs: number of pairs of photos whose matches were left out as contradictory.
+    """
+
+    model: Any | None
+    doubtful: bool
+    removed_pairs: int
+
+
+def mapped(
+    count: int,
+    matches: Path,
+    seed: int,
+    show: Progress,
+    *,
+    sift: bool = True,
+    usable: Mapping[int, npt.NDArray[np.bool_]] | None = None,
+    attempts: Sequence[Thresholds] = THRESHOLDS,
+) -> Mapped:
+    """Place photos.
+
+    Args:
+        count: number of photos.
+        matches: COLMAP's database with features and matches; it may be changed.
+        seed: random seed.
+        show: called with "matching" or "mapping", done and total.
+        sift: whether features are SIFT's, of which more matches can be searched.
+        usable: pixels [H, W] that can have features, by COLMAP's image id, for photos with a mask.
+        attempts: the first ones of ``THRESHOLDS``.
+    """
+    strengths = {pair: len(indices) for pair, indices in links(matches).items()}
+    all_links = len(strengths)
+    hopeless = set(range(count)) - {image - image_id(0) for pair in strengths for image in pair}
+    source, database = matches, with_focal_lengths(matches, seed)
+    best: Any | None = None
+    best_attempt = 0
+    guided: set[int] = set()
+    few_missing = False
+    for attempt, thresholds in enumerate(attempts):
+        extending = few_missing and attempt < FIRST_DOUBTFUL
+        if thresholds.guided_matching:
+            wanted = _missing(best, count) if extending else set(range(count))
+            if not wanted <= guided:
+                guided = wanted
+                more = matched_along_lines(matches, wanted, show) if sift else None
+                if more is not None:
+                    source, database = more, with_focal_lengths(more, seed)
+                elif thresholds == replace(THRESHOLDS[attempt - 1], guided_matching=True):
+                    continue  # nothing differs from the attempt before
+
+        if extending:
+            model = copy.deepcopy(best)
+            extend(model, count, database, thresholds, seed, show)
+        else:
+            model = map_photos(count, database, thresholds, seed, show)
+        for remapping in range(MAX_REMAPPINGS):
+            wrong = _wrong_links(model, source, strengths, usable or {})
+            if not wrong:
+                break
+            if attempt >= FIRST_DOUBTFUL or remapping + 1 == MAX_REMAPPINGS:
+                model = None  # a doubtful model is no reason to leave out matches
+                break
+            for pair in wrong:
+                del strengths[pair]
+            for file in {matches, source}:
+                leave_out(file, wrong)
+            database = with_focal_lengths(source, seed)
+            # Mapped anew, because an extended model would keep its wrong cameras.
+            model = map_photos(count, database, thresholds, seed, show)
+        if model is not None and (best is None or model.num_reg_images() > best.num_reg_images()):
+            best, best_attempt = model, attempt
+        missing = _missing(best, count)
+        if best is not None and len(strengths) < all_links:
+            hopeless = _unlinked(best, strengths, count)
+        if best is not None and (count > MAX_RETRY_PHOTOS or missing <= hopeless):
+            break
+        if attempt == 0:
+            few_missing = len(missing) <= MAX_MISSING_FRACTION * count
+    show("mapping", count, count)
+    return Mapped(best, best_attempt >= FIRST_DOUBTFUL, all_links - len(strengths))
+
+
+def _wrong_links(
+    model: Any | None,
+    source: Path,
+    strengths: dict[Pair, int],
+    usable: Mapping[int, npt.NDArray[np.bool_]],
+) -> set[Pair]:
+    """Pairs of photos whose matches make a model contradict its photos."""
+    if model is None or model.num_reg_images() > MAX_RETRY_PHOTOS:
+        return set()
+    return links_between_parts(strengths, contradictions(model, links(source), usable))
+
+
+def _unlinked(model: Any, strengths: dict[Pair, int], count: int) -> set[int]:
+    """Indices of photos without a chain of matches to a model's photos."""
+    part = parts(strengths, ())
+    of_model = {part.get(image) for image in model.reg_image_ids()}
+    return {index for index in range(count) if part.get(image_id(index)) not in of_model}
+
+
+def _missing(model: Any | None, count: int) -> set[int]:
+    """Indices of photos that are not in a model."""
+    placed = set() if model is None else set(model.reg_image_ids())
+    return {index for index in range(count) if image_id(index) not in placed}

@@ -1,0 +1,154 @@
+"""Matches between photos in copies of COLMAP's database, and focal lengths from them.
+
+Photos without a focal length in EXIF get one from the fundamental matrices of all pairs (Sweeney et
+al., "Optimizing the Viewing Graph for Structure-from-Motion", ICCV 2015): with few photos, a wrong
+initial focal length is the most common failure.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from igsr._internal.load_pycolmap import load_pycolmap
+from igsr.cameras.colmap.database import image_id, photo_file
+from igsr.cameras.colmap.guided_matching import (
+    Constraint,
+    EpipolarLine,
+    Features,
+    Plane,
+    comparable,
+    guided_matches,
+)
+from igsr.cameras.colmap.pairs import in_tiles, pairs_to_match
+from igsr.cameras.estimate import Progress
+
+#: Pairs between two progress reports.
+PAIRS_PER_REPORT = 8
+#: Maximum distance of a match to its epipolar line, pixels (COLMAP's).
+MAX_DISTANCE_PX = 4.0
+
+
+def matched(count: int, features: Path, seed: int, show: Progress) -> Path:
+    """Copy a database of features and add geometrically verified matches.
+
+    Args:
+        count: number of photos.
+        features: the database.
+        seed: of the verification.
+        show: called with "matching", done and total pairs.
+
+    Returns:
+        The new database in the same folder, with unchanged focal lengths.
+    """
+    pycolmap = load_pycolmap()
+    database = features.with_name("matched.db")
+    shutil.copyfile(features, database)
+    pairs = pairs_to_match(count, database)
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.use_gpu = False
+    # The views of a panorama have one center and different directions.
+    matching.skip_image_pairs_in_same_frame = True
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = seed
+    listing = pycolmap.ImportedPairingOptions()
+    listing.match_list_path = database.with_name("pairs.txt")
+    done = 0
+    for tile in in_tiles(pairs):
+        show("matching", done, len(pairs))
+        listing.match_list_path.write_text(
+            "".join(f"{photo_file(a)} {photo_file(b)}\n" for a, b in tile)
+        )
+        pycolmap.match_image_pairs(
+            database,
+            matching_options=matching,
+            pairing_options=listing,
+            verification_options=verification,
+            device=pycolmap.Device.cpu,
+        )
+        done += len(tile)
+    show("matching", done, len(pairs))
+    return database
+
+
+def with_focal_lengths(matches: Path, seed: int) -> Path:
+    """Copy a database of matches and estimate focal lengths from all its pairs."""
+    pycolmap = load_pycolmap()
+    database = matches.with_name(f"calibrated_{matches.name}")
+    shutil.copyfile(matches, database)
+    calibration = pycolmap.ViewGraphCalibrationOptions()
+    calibration.random_seed = seed
+    pycolmap.calibrate_view_graph(database, calibration)
+    return database
+
+
+def with_matches(matches: Path) -> set[int]:
+    """Return the indices of photos with matches; photos without cannot be placed."""
+    pycolmap = load_pycolmap()
+    matched: set[int] = set()
+    with pycolmap.Database.open(matches) as opened:
+        for pair, geometry in zip(*opened.read_two_view_geometries(), strict=True):
+            if len(geometry.inlier_matches):
+                images = pycolmap.pair_id_to_image_pair(pair)
+                matched.update(image - image_id(0) for image in images)
+    return matched
+
+
+def matched_along_lines(matches: Path, wanted: Collection[int], show: Progress) -> Path | None:
+    """Copy a database of matches and add matches along the epipolar lines of pairs.
+
+    Args:
+        matches: the database.
+        wanted: indices of photos that need more matches; only pairs with these are searched.
+        show: called with "matching", done and total pairs.
+
+    Returns:
+        The new database in the same folder; None if no pair gained a match.
+    """
+    pycolmap = load_pycolmap()
+    database = matches.with_name("guided.db")
+    shutil.copyfile(matches, database)
+    images = {image_id(index) for index in wanted}
+    gained = False
+    with pycolmap.Database.open(database) as opened:
+        ids, geometries = opened.read_two_view_geometries()
+        pairs = []
+        for pair, geometry in sorted(zip(ids, geometries, strict=True), key=lambda row: row[0]):
+            a, b = pycolmap.pair_id_to_image_pair(pair)
+            constraint = _constraint(geometry)
+            if constraint is not None and (a in images or b in images):
+                pairs.append((a, b, geometry, constraint))
+        features: dict[int, Features] = {}
+        for done, (a, b, geometry, constraint) in enumerate(pairs):
+            if done % PAIRS_PER_REPORT == 0:
+                show("matching", done, len(pairs))
+            for image in {a, b} - features.keys():
+                features[image] = comparable(
+                    opened.read_keypoints(image)[:, :2], opened.read_descriptors(image).data
+                )
+            inliers = guided_matches(features[a], features[b], constraint)
+            if len(inliers) > len(geometry.inlier_matches):
+                geometry.inlier_matches = inliers
+                opened.update_two_view_geometry(a, b, geometry)
+                gained = True
+            # Bounds memory: pairs are ordered by their first photo.
+            features = {image: kept for image, kept in features.items() if image == a}
+        show("matching", len(pairs), len(pairs))
+    return database if gained else None
+
+
+def _constraint(geometry: Any) -> Constraint | None:
+    """The constraint on further matches of a pair; None if its geometry is unknown."""
+    pycolmap = load_pycolmap()
+    kinds = pycolmap.TwoViewGeometryConfiguration
+    lines = [int(kind) for kind in (kinds.CALIBRATED, kinds.UNCALIBRATED)]
+    planes = [int(kind) for kind in (kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC)]
+    if geometry.config in lines and geometry.F is not None:
+        return EpipolarLine(np.array(geometry.F, dtype=np.float64), MAX_DISTANCE_PX)
+    if geometry.config in planes and geometry.H is not None:
+        return Plane(np.array(geometry.H, dtype=np.float64), MAX_DISTANCE_PX)
+    return None

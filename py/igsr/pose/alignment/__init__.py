@@ -1,9 +1,0 @@
-"""Global alignment: cameras and depths of all photos from pointmaps of pairs of photos."""
-
-from __future__ import annotations
-
-from igsr.pose.alignment.global_alignment import Alignment, align
-from igsr.pose.alignment.predictions import PairPrediction, PhotoToAlign, Predictor
-from igsr.pose.depth_maps import AlignedPhoto
-
-__all__ = ["AlignedPhoto", "Alignment", "PairPrediction", "PhotoToAlign", "Predictor", "align"]

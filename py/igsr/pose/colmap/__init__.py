@@ -1,8 +1,0 @@
-"""Cameras by incremental structure from motion, through pycolmap: SIFT features, matches, mapping.
-
-Nothing is downloaded. Photos with too few matches are not registered.
-"""
-
-from igsr.pose.colmap.estimator import Colmap
-
-__all__ = ["Colmap"]
