@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from capture_files import random_viewmats
 
-from igsr.capture import Camera, Capture, Points, View
+from igsr.capture import Camera, Capture, Points, PseudoView, View
 from igsr.capture.types import Tracks
 from igsr.errors import IgsrError
 
@@ -95,13 +94,25 @@ def test_pixels_must_match_the_camera(image, mask, words):
 
 
 def test_a_background_is_a_color_behind_an_image_without_alpha():
-    view = capture(["a.png"]).views[0]
-    assert replace(view, background=(0.0, 0.5, 1.0)).background == (0.0, 0.5, 1.0)
+    camera = Camera(np.eye(4), np.eye(3), 3, 2)
+
+    def view(background, channels=3):
+        image = np.zeros((2, 3, channels), np.uint8)
+        return PseudoView(
+            "a.png",
+            camera,
+            "train",
+            image,
+            weights=np.ones((2, 3), np.float32),
+            background=background,
+        )
+
+    assert view((0.0, 0.5, 1.0)).background == (0.0, 0.5, 1.0)
     for background in ((0.0, 0.5), (0.0, 0.5, 1.5), (0.0, np.nan, 1.0)):
         with pytest.raises(IgsrError, match=r"a.png: its background must be three numbers in \[0"):
-            replace(view, background=background)
+            view(background)
     with pytest.raises(IgsrError, match=r"a.png: only an image without alpha has a background"):
-        replace(view, image=np.zeros((2, 3, 4), np.uint8), background=(1.0, 1.0, 1.0))
+        view((1.0, 1.0, 1.0), channels=4)
 
 
 def test_holdout_is_by_name_and_keeps_the_order():

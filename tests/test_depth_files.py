@@ -147,7 +147,7 @@ HUGE_SHAPE = b"{'descr': '<f4', 'fortran_order': False, 'shape': (900000, 900000
         ("1.npy", np.full((HEIGHT, WIDTH), None), "cannot be read as depth"),
         ("1.npy", b"\x93NUMPY\x01\x00v\x00{'descr': ", "cannot be read as depth"),
         ("1.npy", b"\x93NUMPY\x01\x00v\x00" + HUGE_SHAPE.ljust(118), "cannot be read as depth"),
-        ("1.exr", b"v/1\x01 no more", "cannot be read as depth: file: is no OpenEXR"),
+        ("1.exr", b"v/1\x01 no more", "cannot be read as depth: file: is not an OpenEXR"),
         ("1.exr", b"", "cannot be read as depth"),
     ],
 )

@@ -238,7 +238,7 @@ def test_sharpest_frames_evenly_spaced(tmp_path):
 def test_a_video_of_one_frame_is_one_photo(tmp_path):
     write_video(tmp_path / "clip.mp4", film(1, {0}))
     assert [photo.name for photo in load_photos(tmp_path)] == ["clip.mp4/000000.png"]
-    with pytest.raises(IgsrError, match=r"2 photos at least; there is only clip\.mp4/000000\.png"):
+    with pytest.raises(IgsrError, match=r"at least 2 photos; there is only clip\.mp4/000000\.png"):
         igsr.find_cameras(tmp_path, "colmap")
 
 

@@ -132,7 +132,7 @@ def show(*progress: object) -> None:
 def matches_of(photos: list[Photo], folder: Path) -> Path:
     features = folder / "features.db"
     list_photos(photos, features)
-    find_features(photos, folder, features, show)
+    find_features(photos, features, show)
     return matched(len(photos), features, 0, show)
 
 

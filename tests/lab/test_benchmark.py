@@ -377,7 +377,7 @@ def test_two_builds_take_turns(tmp_path):
 def test_another_build_replaces_the_packages(tmp_path):
     copy = str(shutil.copy(_core.__file__, tmp_path / "_core.abi3.so"))
     code = (
-        "import sys; from igsr._internal.other_build import use_build; use_build(sys.argv[1]);"
+        "import sys; from igsr_lab.other_build import use_build; use_build(sys.argv[1]);"
         "from igsr_lab.bench import fit_rows, stage_rows, two_builds;"
         "print({module._core.__file__ for module in (fit_rows, stage_rows, two_builds)});"
         "use_build(sys.argv[1])"

@@ -15,8 +15,15 @@ from igsr.capture import Camera, View
 from igsr.denoiser.inputs import BUFFERS, CHANNELS, COLOR
 from igsr.evaluation.scores import BLACK
 from igsr_lab.denoiser import pairs
-from igsr_lab.denoiser.pair_files import OFFSET, SCALE, Pairs, packed, read_pairs, write_pairs
-from igsr_lab.denoiser.pair_renders import rendered_pairs
+from igsr_lab.denoiser.pair_files import (
+    OFFSET,
+    SCALE,
+    Pairs,
+    packed,
+    read_pairs,
+    rendered_pairs,
+    write_pairs,
+)
 from igsr_lab.denoiser.pairs import FITTED_RENDERED, make_pairs
 
 
@@ -60,11 +67,11 @@ def test_eight_bits_keep_what_counts(tmp_path):
     assert np.array_equal(pairs.masks[0], mask)
     data = (tmp_path / "a.npz").read_bytes()
     (tmp_path / "torn.npz").write_bytes(data[: len(data) // 2])
-    with pytest.raises(igsr.IgsrError, match=r"torn\.npz is no whole file of pairs"):
+    with pytest.raises(igsr.IgsrError, match=r"torn\.npz is damaged"):
         read_pairs(tmp_path / "torn.npz")
     with open(tmp_path / "array.npz", "wb") as file:
         np.save(file, truth)
-    with pytest.raises(igsr.IgsrError, match=r"array\.npz is no whole file of pairs"):
+    with pytest.raises(igsr.IgsrError, match=r"array\.npz is damaged"):
         read_pairs(tmp_path / "array.npz")
     for at in range(100, len(data) - 100, 7):
         (tmp_path / "flipped.npz").write_bytes(data[:at] + bytes([data[at] ^ 255]) + data[at + 1 :])
@@ -168,7 +175,7 @@ def test_photos_of_several_sizes_are_refused_before_the_first_fit(tmp_path, monk
         for view in made.views[:4]
     ]
     scenes.write_capture(tmp_path / "mixed", igsr.Capture(made.path, tall + made.views[4:]))
-    monkeypatch.setattr(pairs, "fit_with_cameras", lambda *_, **__: pytest.fail("it is fitted"))
+    monkeypatch.setattr(pairs, "fit_capture", lambda *_, **__: pytest.fail("it is fitted"))
     with pytest.raises(igsr.IgsrError, match="views to render are of sizes"):
         make_pairs([tmp_path / "mixed"], tmp_path / "out", recipes=["noise"], backend="cpu")
 

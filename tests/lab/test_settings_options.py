@@ -10,7 +10,7 @@ import typer
 from typer.testing import CliRunner
 
 from igsr._internal.settings import about
-from igsr_lab.commands.settings_options import settings_options
+from igsr_lab.commands.denoiser import settings_options
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -45,7 +45,7 @@ PAIR_PROTOCOL = (
 #: The build must be loaded before the benchmark is imported.
 _CHILD = """
 import sys
-from igsr._internal.other_build import use_build
+from igsr_lab.other_build import use_build
 use_build(sys.argv[1])
 from igsr_lab.bench.two_builds import answer
 answer(sys.argv[2])
