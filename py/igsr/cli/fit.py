@@ -47,6 +47,55 @@ from igsr.cli.output import (
 
 Start = Literal["auto", "points", "depths", "hull", "sift", "rays", "random"]
 
+StepsOption = Annotated[
+    int | None, option("--steps", metavar="N", help="Optimizer steps.", panel=FIT)
+]
+MaxSplatsOption = Annotated[
+    int | None,
+    option("--max-splats", metavar="N", help="Maximum number of splats.", panel=FIT),
+]
+PosesOption = Annotated[
+    Literal["fixed", "joint"],
+    option("--poses", help="joint: optimize camera poses, too.", panel=FIT),
+]
+FocalOption = Annotated[
+    Literal["fixed", "shared", "per-camera"],
+    option("--focal", help="Focal lengths to optimize.", panel=FIT),
+]
+KeepFloatersOption = Annotated[
+    bool, option("--keep-floaters", help="Do not remove floaters.", panel=FIT)
+]
+DegreeOption = Annotated[
+    int | None,
+    option("--sh-degree", metavar="0..4", help="Spherical-harmonics degree.", panel=ADVANCED),
+]
+DensityOption = Annotated[
+    Literal["mcmc", "original", "fixed"] | None,
+    option("--density", help="Density control.", panel=ADVANCED),
+]
+StartOption = Annotated[
+    Start,
+    option(
+        "--start",
+        metavar="NAME",
+        help="Initialization: auto, points, depths, hull, sift, rays or random.",
+        panel=ADVANCED,
+    ),
+]
+BlocksOption = Annotated[
+    str | None,
+    option(
+        "--blocks",
+        metavar="auto|N",
+        help="Fit in N blocks, for scenes larger than memory.",
+        panel=ADVANCED,
+    ),
+]
+RayOption = Annotated[
+    str | None,
+    option("--ray", metavar="ADDRESS", help="Fit blocks on this Ray cluster.", panel=ADVANCED),
+]
+
 
 def fit_command(
     photos: PhotosArgument = None,
@@ -64,57 +113,19 @@ def fit_command(
     checkpoint: CheckpointOption = None,
     frames: FramesOption = FRAMES,
     allow_missing: AllowMissingOption = False,
-    steps: Annotated[
-        int | None, option("--steps", metavar="N", help="Optimizer steps.", panel=FIT)
-    ] = None,
-    max_splats: Annotated[
-        int | None,
-        option("--max-splats", metavar="N", help="Maximum number of splats.", panel=FIT),
-    ] = None,
-    poses: Annotated[
-        Literal["fixed", "joint"],
-        option("--poses", help="joint: optimize camera poses, too.", panel=FIT),
-    ] = "fixed",
-    focal: Annotated[
-        Literal["fixed", "shared", "per-camera"],
-        option("--focal", help="Focal lengths to optimize.", panel=FIT),
-    ] = "fixed",
+    steps: StepsOption = None,
+    max_splats: MaxSplatsOption = None,
+    poses: PosesOption = "fixed",
+    focal: FocalOption = "fixed",
     transients: TransientsOption = "auto",
-    keep_floaters: Annotated[
-        bool, option("--keep-floaters", help="Do not remove floaters.", panel=FIT)
-    ] = False,
-    sh_degree: Annotated[
-        int | None,
-        option("--sh-degree", metavar="0..4", help="Spherical-harmonics degree.", panel=ADVANCED),
-    ] = None,
-    density: Annotated[
-        Literal["mcmc", "original", "fixed"] | None,
-        option("--density", help="Density control.", panel=ADVANCED),
-    ] = None,
-    start: Annotated[
-        Start,
-        option(
-            "--start",
-            metavar="NAME",
-            help="Initialization: auto, points, depths, hull, sift, rays or random.",
-            panel=ADVANCED,
-        ),
-    ] = "auto",
+    keep_floaters: KeepFloatersOption = False,
+    sh_degree: DegreeOption = None,
+    density: DensityOption = None,
+    start: StartOption = "auto",
     background: BackgroundOption = None,
     seed: SeedOption = 0,
-    blocks: Annotated[
-        str | None,
-        option(
-            "--blocks",
-            metavar="auto|N",
-            help="Fit in N blocks, for scenes larger than memory.",
-            panel=ADVANCED,
-        ),
-    ] = None,
-    ray: Annotated[
-        str | None,
-        option("--ray", metavar="ADDRESS", help="Fit blocks on this Ray cluster.", panel=ADVANCED),
-    ] = None,
+    blocks: BlocksOption = None,
+    ray: RayOption = None,
 ) -> None:
     """Fit splats to PHOTOS and score them.
 

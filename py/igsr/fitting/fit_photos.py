@@ -6,6 +6,7 @@ import os
 from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -157,38 +158,20 @@ def fit(
     chosen = checked_given(FitSettings, given | named)
     name = check_fits(backend)["backend"]
     max_size = default_max_size(name, quality) if max_size is None else max_size
-    options = dict(estimator_options or {})
-    cameras = CameraSettings(estimator, options, seed, frames, allow_missing)
+    cameras = CameraSettings(estimator, dict(estimator_options or {}), seed, frames, allow_missing)
+    loading: dict[str, Any] = {"holdout": holdout, "max_size": max_size}
 
     with ExitStack() as ending, open_run(out, progress, resume=resume) as run:
-
-        def announce(seen: Overview, cameras_known: bool) -> None:
-            if chosen.get("start") == "hull" and seen.channels < 4:
-                raise IgsrError(f"{photos} has photos without alpha; start hull needs it in all.")
-            if run.is_followed:
-                for sentence in announcement(
-                    seen,
-                    holdout=holdout,
-                    max_size=max_size,
-                    quality=quality,
-                    given=chosen,
-                    backend=name,
-                    cameras_known=cameras_known,
-                ):
-                    run.note(sentence)
-
         followed = None
         if run.out is not None:
             followed = ending.enter_context(FollowedRun(run.out))
             run.add_listener(followed)
-        loaded = load_photos(
-            photos, run, cameras, holdout=holdout, max_size=max_size, announce=announce
+        announce = partial(
+            _announce, run=run, chosen=chosen, quality=quality, backend=name, **loading
         )
+        loaded = load_photos(photos, run, cameras, announce=announce, **loading)
         capture = loaded.capture
-        color = default_background(capture)
-        if background is not None:
-            red, green, blue = (float(channel) for channel in background)
-            color = (red, green, blue)
+        color = chosen.get("background") or default_background(capture)
         if followed is not None:
             followed.show(capture, color)
         if any(view.image.shape[2] == 4 for view in capture.train_views):
@@ -209,9 +192,8 @@ def fit(
             return result
         asked = {
             "capture": str(capture.path),
-            "holdout": holdout,
-            "max_size": max_size,
             "quality": quality,
+            **loading,
             **result.settings.plain(),
             "backend": name,
             "estimator": estimator,
@@ -222,6 +204,33 @@ def fit(
             "igsr": _core.__version__,
         }
         return _written(run, run.out, result, color, asked, cameras_found=loaded.cameras_found)
+
+
+def _announce(
+    seen: Overview,
+    cameras_known: bool,
+    *,
+    run: Run,
+    chosen: dict[str, Any],
+    holdout: int | None,
+    max_size: int,
+    quality: Quality,
+    backend: str,
+) -> None:
+    """Tell a person what will be done, once the photos are counted."""
+    if chosen.get("start") == "hull" and seen.channels < 4:
+        raise IgsrError(f"{seen.path} has photos without alpha; start hull needs it in all.")
+    if run.is_followed:
+        for sentence in announcement(
+            seen,
+            holdout=holdout,
+            max_size=max_size,
+            quality=quality,
+            given=chosen,
+            backend=backend,
+            cameras_known=cameras_known,
+        ):
+            run.note(sentence)
 
 
 def _written(

@@ -46,64 +46,73 @@ class WorkloadChoice(str, enum.Enum):
     W4 = "W4"
 
 
+BackendsOption = Annotated[
+    list[BackendChoice] | None, option("--backend", help="Repeatable. Default: auto.")
+]
+WorkloadsOption = Annotated[
+    list[WorkloadChoice] | None, option("--workload", help="Repeatable. Default: all.")
+]
+ModelsOption = Annotated[
+    Path | None,
+    option("--models", metavar="DIR", help="For W3: folder of fitted models. Default: out/bench."),
+]
+PlotOption = Annotated[
+    Path | None, option("--plot", metavar="PNG", help="Plot time against error.")
+]
+JsonOption = Annotated[
+    Path | None, option("--json", metavar="FILE", help="Write the machine and all rows.")
+]
+AccuracyOption = Annotated[
+    Path | None,
+    option(
+        "--accuracy",
+        metavar="FILE",
+        help="Instead of workloads, measure every setting; write a page like "
+        "docs/how-it-works/accuracy.md and its plot.",
+    ),
+]
+ReportOption = Annotated[
+    Path | None,
+    option(
+        "--report",
+        metavar="HTML",
+        help="Write a page about this GPU (driver, limits, all rows) and a JSON file, to "
+        "attach to bug reports.",
+    ),
+]
+CompareOption = Annotated[
+    Path | None,
+    option(
+        "--compare",
+        metavar="FILE",
+        help="Time W1 and W4 in turns with another build: the compiled module "
+        "(igsr/_core*.so) of another checkout.",
+    ),
+]
+FailAboveOption = Annotated[
+    float | None,
+    option(
+        "--fail-above",
+        metavar="PERCENT",
+        help="With --compare: exit with status 1 if this build takes that much longer.",
+    ),
+]
+
+
 def bench_command(
-    backends: Annotated[
-        list[BackendChoice] | None, option("--backend", help="Repeatable. Default: auto.")
-    ] = None,
-    workloads: Annotated[
-        list[WorkloadChoice] | None, option("--workload", help="Repeatable. Default: all.")
-    ] = None,
+    backends: BackendsOption = None,
+    workloads: WorkloadsOption = None,
     garden: GardenOption = None,
     capture: CaptureOption = None,
-    models: Annotated[
-        Path | None,
-        option(
-            "--models", metavar="DIR", help="For W3: folder of fitted models. Default: out/bench."
-        ),
-    ] = None,
+    models: ModelsOption = None,
     seed: Annotated[int, option("--seed", help="Random seed of the workloads.")] = 0,
     seconds: SecondsOption = 2.0,
-    plot: Annotated[
-        Path | None, option("--plot", metavar="PNG", help="Plot time against error.")
-    ] = None,
-    json_path: Annotated[
-        Path | None, option("--json", metavar="FILE", help="Write the machine and all rows.")
-    ] = None,
-    accuracy: Annotated[
-        Path | None,
-        option(
-            "--accuracy",
-            metavar="FILE",
-            help="Instead of workloads, measure every setting; write a page like "
-            "docs/how-it-works/accuracy.md and its plot.",
-        ),
-    ] = None,
-    report_path: Annotated[
-        Path | None,
-        option(
-            "--report",
-            metavar="HTML",
-            help="Write a page about this GPU (driver, limits, all rows) and a JSON file, to "
-            "attach to bug reports.",
-        ),
-    ] = None,
-    compare: Annotated[
-        Path | None,
-        option(
-            "--compare",
-            metavar="FILE",
-            help="Time W1 and W4 in turns with another build: the compiled module "
-            "(igsr/_core*.so) of another checkout.",
-        ),
-    ] = None,
-    fail_above: Annotated[
-        float | None,
-        option(
-            "--fail-above",
-            metavar="PERCENT",
-            help="With --compare: exit with status 1 if this build takes that much longer.",
-        ),
-    ] = None,
+    plot: PlotOption = None,
+    json_path: JsonOption = None,
+    accuracy: AccuracyOption = None,
+    report_path: ReportOption = None,
+    compare: CompareOption = None,
+    fail_above: FailAboveOption = None,
 ) -> None:
     """Measure speed, and error against the float64 reference, of the backends.
 
