@@ -9,7 +9,7 @@ import pytest
 import refinements
 
 from igsr import cli
-from igsr.refinement import rounds
+from igsr.refinement import refine_photos, rounds
 from igsr_lab import __main__ as lab
 
 # Its numbers are megabytes that are not here: it is run where a folder of them is named.
@@ -59,13 +59,14 @@ def helped(few_photos, tmp_path_factory):
 def rendered(monkeypatch):
     """The reconstructions that refinements render novel views of, in order."""
     seen = []
-    propose = rounds.propose
+    propose = rounds.propose_views
 
     def watched(context, fitted):
         seen.append(fitted)
         return propose(context, fitted)
 
-    monkeypatch.setattr(rounds, "propose", watched)
+    for module in (rounds, refine_photos):
+        monkeypatch.setattr(module, "propose_views", watched)
     return seen
 
 

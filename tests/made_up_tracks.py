@@ -29,5 +29,5 @@ def tracked(
         point.append(seen)
         xy.append(places + noise * random.normal(size=places.shape))
     tracks = Tracks([one.name for one in views], *map(np.concatenate, (view, point, xy)))
-    grey = np.full((len(xyz), 3), 128, np.uint8)
-    return Points(xyz, grey, tracks=tracks)
+    gray = np.full((len(xyz), 3), 128, np.uint8)
+    return Points(xyz, gray, tracks=tracks)

@@ -50,7 +50,7 @@ def rasterized(scene, **options):
 
 
 def splats(count=40, degree=1, seed=0, origin=(0.0, 0.0, 0.0)):
-    """A ball of opaque coloured splats around ``origin``."""
+    """A ball of opaque colored splats around ``origin``."""
     random = np.random.default_rng(seed)
     quats = random.normal(size=(count, 4))
     return Splats(

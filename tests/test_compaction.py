@@ -162,10 +162,10 @@ def test_a_wall_of_one_color_is_compacted():
     assert compaction.report["result"]["splats"] == len(compaction.splats)
     # Seen from a place that no camera of the search stands at.
     camera = scenes.ring_camera(0.3, size=56, distance=3.0)
-    grey = (0.5, 0.5, 0.5)
+    gray = (0.5, 0.5, 0.5)
     change = metrics.psnr(
         *(
-            igsr.render(splats, camera, grey, "cpu").to_uint8()
+            igsr.render(splats, camera, gray, "cpu").to_uint8()
             for splats in (compaction.splats, whole)
         )
     )

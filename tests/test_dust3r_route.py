@@ -113,7 +113,7 @@ def test_photos_in_fit_and_scores_out(tmp_path, monkeypatch, igsr_here):
     assert report["refined"]["psnr"] > GOOD
 
 
-def test_points_lie_on_the_scene_with_its_colours(scene, estimate):
+def test_points_lie_on_the_scene_with_its_colors(scene, estimate):
     world = similarity_between(estimate.cameras, scene.cameras)
     points = estimate.points
     xyz = world.scale * points.xyz @ world.rotation.T + world.translation

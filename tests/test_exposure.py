@@ -32,7 +32,7 @@ from igsr.refinement.cut_highlights import with_cut_highlights
 
 def with_exposure(view: View, exposure: Exposure) -> View:
     """The photo with an exposure applied to its colors."""
-    colors = exposure.given_to(view.image[..., :3].astype(np.float32) / 255.0)
+    colors = exposure.apply_to(view.image[..., :3].astype(np.float32) / 255.0)
     pixels = np.floor(np.clip(colors, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
     return replace(view, image=np.concatenate([pixels, view.image[..., 3:]], axis=2))
 
@@ -159,10 +159,10 @@ def test_impossible_exif_is_ignored(tmp_path):
 def test_taking_an_exposure_out_undoes_it():
     view = wall(count=1)[0][0]
     exposure = Exposure((1.2, 0.9, 1.0), (0.01, 0.03, -0.02))
-    back = exposure.taken_out_of(with_exposure(view, exposure).image)
+    back = exposure.remove_from(with_exposure(view, exposure).image)
     assert np.abs(back.astype(int) - view.image).max() <= 1
     alpha = np.full((*view.image.shape[:2], 1), 77, np.uint8)
-    with_alpha = exposure.taken_out_of(np.concatenate([view.image, alpha], axis=2))
+    with_alpha = exposure.remove_from(np.concatenate([view.image, alpha], axis=2))
     assert (with_alpha[..., 3] == 77).all()
     for bad in ({"gain": (1.0, 0.0, 1.0)}, {"gain": (1.0, 2.0)}, {"offset": (0.0, np.nan, 0.0)}):
         with pytest.raises(igsr.IgsrError, match=next(iter(bad))):
@@ -253,7 +253,7 @@ def test_apply_exposure_matches_the_renderer():
         tensor.requires_grad_()
     assert torch.autograd.gradcheck(igsr.apply_exposure, (image, gain, offset))
     one = Exposure(tuple(gain[0].tolist()), tuple(offset[0].tolist()))
-    expected = one.given_to(image[0].detach().numpy().astype(np.float32))
+    expected = one.apply_to(image[0].detach().numpy().astype(np.float32))
     got = igsr.apply_exposure(image, gain, offset)[0].detach().numpy()
     np.testing.assert_allclose(got, expected, atol=1e-6)
 
@@ -322,7 +322,7 @@ def test_clipped_highlights_are_as_bright_as_the_fit_shows(gain):
         color = igsr.render(model, view.camera, backend="cpu").color
         image, exposed = (
             np.clip(255.0 * colors + 0.5, 0.0, 255.0).astype(np.uint8)
-            for colors in (color, exposure.given_to(color))
+            for colors in (color, exposure.apply_to(color))
         )
         views.append(replace(view, image=exposed, exposure=exposure))
         true.append(image.astype(int))

@@ -93,7 +93,7 @@ def test_text_is_escaped(tmp_path):
     stop = Stop(StopReason.NO_NOVEL_VIEW)
     refined = Refined(splats, splats, None, capture, [], stop, [], {"fit": 1.0})
     report = report_of(refined, RefineSettings(backend="cpu"))
-    report["not_registered"] = ["<i>lost</i>.png"]
+    report["photos"]["not_placed"] = ["<i>lost</i>.png"]
     write_page(tmp_path / "report.html", refined, report)
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "alert(" in page

@@ -14,7 +14,7 @@ from igsr.refinement.results import StopReason
 
 def test_the_nearest_photos_are_held_and_no_more(ball_photos, helped, monkeypatch):
     monkeypatch.setattr(near_sources, "NEAR", 3)
-    monkeypatch.setattr(near_sources, "HELD", 4)
+    monkeypatch.setattr(near_sources, "CACHED", 4)
     made = []
     real = near_sources.photo_sources
 
@@ -33,7 +33,7 @@ def test_the_nearest_photos_are_held_and_no_more(ball_photos, helped, monkeypatc
         distances = [np.linalg.norm(p.camera.center - photo.camera.center) for p in photos]
         farthest = max(np.linalg.norm(one.camera.center - photo.camera.center) for one in near)
         assert farthest <= np.sort(distances)[2] + 1e-9
-        assert len(sources._held) <= 4
+        assert len(sources._cached) <= 4
     assert len(made) > len(photos), "a freed photo is made again"
     again = len(made)
     sources.of(photos[0].camera)

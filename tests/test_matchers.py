@@ -9,6 +9,7 @@ import pytest
 import rooms
 
 import igsr
+from igsr.cameras import find
 from igsr.cameras.colmap import Colmap
 from igsr.cameras.colmap.matcher import PhotoFeatures
 from igsr.cameras.find import CameraSettings
@@ -134,3 +135,9 @@ def test_a_matcher_needs_a_name_and_few_photos() -> None:
 def test_kept_cameras_have_the_name_of_their_matcher() -> None:
     settings = CameraSettings("colmap", {"matcher": Known()})
     assert settings.made_by()["options"] == {"matcher": "known"}
+
+
+def test_kept_cameras_of_auto_depend_on_all_methods(monkeypatch) -> None:
+    before = CameraSettings().made_by()
+    monkeypatch.setitem(find.METHODS, "colmap", 1000)
+    assert CameraSettings().made_by() != before

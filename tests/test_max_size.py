@@ -19,7 +19,7 @@ from igsr.capture.downscaling import (
     reduced_size,
     reduced_view,
 )
-from igsr.capture.photo_folder import load_photos
+from igsr.capture.photo_folder import read_photos
 from igsr.errors import IgsrError
 
 # --- the area filter ------------------------------------------------------------------------------
@@ -73,7 +73,7 @@ def test_sizes():
 
 
 @pytest.mark.parametrize("size", [0, -3, 2.5, True, "big"])
-@pytest.mark.parametrize("load", [load_capture, load_photos])
+@pytest.mark.parametrize("load", [load_capture, read_photos])
 def test_bad_sizes_are_refused(tmp_path, size, load):
     write_transforms(tmp_path)
     with pytest.raises(IgsrError, match=r"max_size is .*; give the longest side in pixels"):
@@ -190,7 +190,7 @@ def test_jpegs_of_any_size_keep_their_places(tmp_path):
     for name in ("a", "b"):
         Image.fromarray(ramps).save(tmp_path / f"{name}.jpg", quality=98, subsampling=0)
     for size in (200, 101, 64, 50, 25):
-        image = load_photos(tmp_path, max_size=size)[0].image
+        image = read_photos(tmp_path, max_size=size)[0].image
         expected, _ = area_means(ramps, *reduced_size(403, 301, size))
         assert image.shape == expected.shape
         difference = image.astype(int) - expected
@@ -205,11 +205,11 @@ def test_turned_photos_and_their_masks(tmp_path, orientation):
     exif.get_ifd(0x8769)[0xA405] = 26
     for name in ("a", "b"):
         Image.fromarray(photo(1)).save(tmp_path / f"{name}.png", exif=exif)
-    whole = load_photos(tmp_path)[0]
+    whole = read_photos(tmp_path)[0]
     mask = np.zeros(whole.image.shape[:2], dtype=np.uint8)
     mask[:10, :20] = 255
     save(tmp_path / "masks/a.png", mask)
-    small, plain = load_photos(tmp_path, max_size=24)
+    small, plain = read_photos(tmp_path, max_size=24)
     size = reduced_size(whole.image.shape[1], whole.image.shape[0], 24)
     image, kept = area_means(whole.image, *size, mask > 0)
     np.testing.assert_array_equal(small.image, image)
@@ -229,7 +229,7 @@ def test_photos_of_different_sizes(tmp_path):
         (24, [(24, 16), (24, 16), (1, 1)]),
         (1, [(1, 1)] * 3),
     ):
-        photos = load_photos(tmp_path, max_size=max_size)
+        photos = read_photos(tmp_path, max_size=max_size)
         assert [photo.image.shape[1::-1] for photo in photos] == expected
 
 

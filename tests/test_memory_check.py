@@ -12,7 +12,7 @@ from capture_files import photo, save, write_transforms
 
 from igsr.capture import load_capture, memory_check
 from igsr.capture.memory_check import USABLE_PART, PhotoSizes, available_memory
-from igsr.capture.photo_folder import load_photos
+from igsr.capture.photo_folder import read_photos
 from igsr.errors import IgsrError
 
 TWELVE_MP = PhotoSizes(sizes=[(4000, 3000)] * 100)
@@ -74,7 +74,7 @@ def test_photos_are_refused_before_any_is_decoded(tmp_path, monkeypatch):
     with pytest.raises(IgsrError, match="3 photos of 48x32 would need"):
         load_capture(tmp_path / "capture")
     with pytest.raises(IgsrError, match="3 photos of 400x300 would need"):
-        load_photos(tmp_path / "photos")
+        read_photos(tmp_path / "photos")
 
 
 def test_available_memory():

@@ -7,7 +7,7 @@ import pytest
 import scenes
 
 import igsr
-from igsr.refinement.novel_views import CLOSE, LEAST_STEP, STEP, novel_views
+from igsr.refinement.novel_views import CLOSE, MIN_STEP, STEP, novel_views
 
 BALL = scenes.splats()
 
@@ -26,7 +26,7 @@ def test_views_lie_near_known_ones_and_apart_and_look_at_the_ball():
     for view in found:
         nearest = min(angle(view.camera, other) for other in seen)
         # About what each camera looks at, which is near the ball's middle but not there.
-        assert nearest > 0.8 * LEAST_STEP * STEP
+        assert nearest > 0.8 * MIN_STEP * STEP
         assert min(angle(view.camera, other) for other in known) < 1.3 * max(STEP, 17.2)
         towards = -view.camera.center / np.linalg.norm(view.camera.center)
         assert towards @ view.camera.viewmat[2, :3] > 0.99

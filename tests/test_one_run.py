@@ -62,6 +62,14 @@ def run(command, photos, out, weights, **options):
     return igsr.refine(photos, 1, out=out, denoiser=denoiser, **SHORT, **options)
 
 
+@pytest.mark.parametrize("command", [igsr.fit, igsr.refine])
+def test_arguments_that_do_not_fit_the_photos_are_refused(command):
+    with pytest.raises(igsr.IgsrError, match="photos is a capture, which has cameras; leave out"):
+        command(MADE, estimator="colmap")
+    with pytest.raises(igsr.IgsrError, match="photos must be a capture, a folder or a video, not"):
+        command(["a.jpg", "b.jpg"])
+
+
 def files_in(folder):
     """Content of each file below a folder, by path."""
     paths = (path for path in folder.rglob("*") if path.is_file())

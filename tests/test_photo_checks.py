@@ -15,7 +15,7 @@ from PIL import Image, ImageDraw, ImageFilter
 import igsr
 from igsr.capture import Camera, Capture, View
 from igsr.capture.photo_checks import check_photos, is_screenshot, split_unfit
-from igsr.capture.photo_folder import Photo, load_photos
+from igsr.capture.photo_folder import Photo, read_photos
 from igsr.capture.sharpness import blur, blurred_photos
 from igsr.capture.types import intrinsic_matrix
 from igsr.errors import IgsrError
@@ -125,7 +125,7 @@ def test_exif_of_a_screenshot(tmp_path, photos):
     for index, comment in enumerate((b"Screenshot", b"A screenshot of nothing")):
         exif.get_ifd(0x8769)[0x9286] = b"ASCII\0\0\0" + comment
         Image.fromarray(photos[index].image).save(tmp_path / f"{index}.jpg", exif=exif)
-    assert [photo.screenshot for photo in load_photos(tmp_path)] == [True, False]
+    assert [photo.screenshot for photo in read_photos(tmp_path)] == [True, False]
 
 
 # --- blur ---------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from test_capture_photos import write_png
 
 import igsr
 from igsr.capture import memory_check
-from igsr.capture.photo_folder import load_photos
+from igsr.capture.photo_folder import read_photos
 from igsr.capture.video_frames import MIN_FRAMES, sharpest_frames
 from igsr.errors import IgsrError
 
@@ -44,7 +44,7 @@ def exif_of(orientation=1, **sub_folder):
 def test_formats(tmp_path, suffix):
     for name in ("a", "b"):
         Image.fromarray(smooth()).save(tmp_path / (name + suffix), quality=95)
-    photos = load_photos(tmp_path)
+    photos = read_photos(tmp_path)
     assert [photo.name for photo in photos] == ["a" + suffix, "b" + suffix]
     assert photos[0].image.dtype == np.uint8
     assert np.abs(photos[0].image.astype(int) - smooth()).mean() < 4.0
@@ -54,7 +54,7 @@ def test_formats(tmp_path, suffix):
 def test_sixteen_bits_and_alpha(tmp_path):
     write_png(tmp_path / "a.png", photo(2).astype(np.uint16) * 257, 2)
     save(tmp_path / "b.png", photo(3, channels=4))
-    wide, alpha = load_photos(tmp_path)
+    wide, alpha = read_photos(tmp_path)
     np.testing.assert_array_equal(wide.image, photo(2))
     np.testing.assert_array_equal(alpha.image, photo(3, channels=4))
 
@@ -64,7 +64,7 @@ def test_exif_orientation_is_applied(tmp_path, orientation):
     stored = Image.fromarray(photo(1))
     stored.save(tmp_path / "a.png", exif=exif_of(orientation))
     stored.save(tmp_path / "b.png", exif=exif_of(9))  # does not exist
-    turned, upright = load_photos(tmp_path)
+    turned, upright = read_photos(tmp_path)
     with Image.open(tmp_path / "a.png") as image:
         np.testing.assert_array_equal(turned.image, np.array(ImageOps.exif_transpose(image)))
     np.testing.assert_array_equal(upright.image, photo(1))
@@ -73,7 +73,7 @@ def test_exif_orientation_is_applied(tmp_path, orientation):
 def test_turned_heic_is_turned_once(tmp_path):
     for name in ("a.heic", "b.heic"):
         Image.fromarray(smooth()).save(tmp_path / name, exif=exif_of(6).tobytes(), quality=95)
-    image = load_photos(tmp_path)[0].image
+    image = read_photos(tmp_path)[0].image
     assert image.shape == (48, 32, 3)
     assert np.abs(image.astype(int) - np.rot90(smooth(), -1)).mean() < 4.0
 
@@ -94,7 +94,7 @@ def test_focal_length_and_device_from_exif(tmp_path):
     ]
     for index, (exif, _) in enumerate(expected):
         Image.fromarray(photo(1, 400, 300)).save(tmp_path / f"{index}.jpg", exif=exif)
-    photos = load_photos(tmp_path)
+    photos = read_photos(tmp_path)
     assert [photo.focal for photo in photos] == [pytest.approx(value) for _, value in expected]
     assert photos[2].image.shape == (400, 300, 3)
     assert {photo.device for photo in photos} == {"Maker Model 1"}
@@ -105,7 +105,7 @@ def test_impossible_or_damaged_exif_is_ignored(tmp_path):
     exifs = [exif_of(seconds=t, f_number=f, iso=iso) for t, f, iso in bad]
     for index, exif in enumerate([*exifs, b"Exif\0\0II*\0\xff\xff\xff\xff"]):
         Image.fromarray(photo(1)).save(tmp_path / f"{index}.jpg", exif=exif)
-    photos = load_photos(tmp_path)
+    photos = read_photos(tmp_path)
     assert [photo.exposure_value for photo in photos] == [None] * 4
     assert photos[3].device is None
 
@@ -115,7 +115,7 @@ def test_subfolders_are_read_and_other_files_ignored(tmp_path):
         save(tmp_path / name, photo(1, 20 + len(name), 30))
     save(tmp_path / "masks/b.png", np.full((30, 25), 255, dtype=np.uint8))
     (tmp_path / "notes.txt").write_text("no photo")
-    photos = load_photos(str(tmp_path))
+    photos = read_photos(str(tmp_path))
     assert [photo.name for photo in photos] == ["a/c.png", "a/d/e.JPG", "b.png"]
     assert [photo.image.shape[1] for photo in photos] == [27, 29, 25]
 
@@ -127,14 +127,14 @@ def test_masks_by_either_name(tmp_path):
     mask[:, 20:] = 255
     save(tmp_path / "masks/1.jpg.png", mask)
     save(tmp_path / "masks/a/2.png", 255 - mask)
-    photos = {photo.name: photo for photo in load_photos(tmp_path)}
+    photos = {photo.name: photo for photo in read_photos(tmp_path)}
     np.testing.assert_array_equal(photos["1.jpg"].mask, mask > 0)
     np.testing.assert_array_equal(photos["a/2.jpg"].mask, mask == 0)
     assert photos["3.jpg"].mask is None
-    assert {photo.name for photo in load_photos(tmp_path / "images")} == set(photos)
+    assert {photo.name for photo in read_photos(tmp_path / "images")} == set(photos)
     save(tmp_path / "masks/3.png", mask.T)
     with pytest.warns(UserWarning, match=r"masks/3\.png is 32x48 pixels but its photo 3\.jpg"):
-        assert len(load_photos(tmp_path)) == 2
+        assert len(read_photos(tmp_path)) == 2
 
 
 @pytest.mark.parametrize("suffix", [".heic", ".jpg", ".png", ".webp"])
@@ -147,7 +147,7 @@ def test_damaged_photo_is_left_out_by_name(tmp_path, suffix):
     for length in (0, 20, len(whole) // 2):
         broken.write_bytes(whole[:length])
         with pytest.warns(UserWarning, match=rf"One of 3 photos is left out: .*b\{suffix}"):
-            assert [photo.name for photo in load_photos(tmp_path)] == ["a.png", "c.png"]
+            assert [photo.name for photo in read_photos(tmp_path)] == ["a.png", "c.png"]
     random = np.random.default_rng(0)
     for _ in range(20):
         damaged = np.frombuffer(whole, np.uint8).copy()
@@ -155,11 +155,11 @@ def test_damaged_photo_is_left_out_by_name(tmp_path, suffix):
         broken.write_bytes(damaged)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            assert len(load_photos(tmp_path)) in (2, 3)
+            assert len(read_photos(tmp_path)) in (2, 3)
     (tmp_path / "a.png").unlink()
     broken.write_bytes(b"no photo at all")
     with pytest.raises(IgsrError, match=rf"b\{suffix} cannot be read as an image"):
-        load_photos(tmp_path)
+        read_photos(tmp_path)
 
 
 def test_several_damaged_photos_are_one_sentence(tmp_path):
@@ -168,7 +168,7 @@ def test_several_damaged_photos_are_one_sentence(tmp_path):
     for index in range(3, 9):
         (tmp_path / f"{index}.png").write_bytes(b"nothing")
     with pytest.warns(UserWarning, match=r"6 of 9 .*3\.png .*; so are 4\.png, .* and 2 more$"):
-        assert len(load_photos(tmp_path)) == 3
+        assert len(read_photos(tmp_path)) == 3
 
 
 def test_bad_arguments(tmp_path, monkeypatch):
@@ -180,19 +180,19 @@ def test_bad_arguments(tmp_path, monkeypatch):
         ([tmp_path / "1.png"], "does not exist"),
     ):
         with pytest.raises(IgsrError, match=words):
-            load_photos(path)
+            read_photos(path)
     first, second = save(tmp_path / "1.png", photo(1)), save(tmp_path / "b/2.png", photo(2))
     text = tmp_path / "a.txt"
     text.write_text("")
     for files, words in (([first, first], "given twice"), ([first, text], r"a\.txt is no photo")):
         with pytest.raises(IgsrError, match=words):
-            load_photos(files)
+            read_photos(files)
     with pytest.raises(IgsrError, match="frames is 0"):
-        load_photos(tmp_path, frames=0)
-    assert [photo.name for photo in load_photos([second, first])] == ["b/2.png", "1.png"]
+        read_photos(tmp_path, frames=0)
+    assert [photo.name for photo in read_photos([second, first])] == ["b/2.png", "1.png"]
     monkeypatch.setattr(memory_check, "available_memory", lambda: 8192)
     with pytest.raises(IgsrError, match=r"The 2 photos of 48x32 would need 0.0 GB and 0.0 GB are"):
-        load_photos(tmp_path)
+        read_photos(tmp_path)
 
 
 # --- videos -------------------------------------------------------------------------------------
@@ -227,17 +227,17 @@ def test_sharpest_frames_evenly_spaced(tmp_path):
     chosen = [index for index, _ in sharpest_frames(tmp_path / "clip.mp4", 4)]
     assert chosen[:2] == [7, 24]
     assert all(16 * span + 4 <= index < 16 * span + 12 for span, index in enumerate(chosen))
-    photos = load_photos(tmp_path, frames=4)
+    photos = read_photos(tmp_path, frames=4)
     assert [photo.name for photo in photos] == [f"clip.mp4/{index:06d}.png" for index in chosen]
     assert {photo.device for photo in photos} == {"video clip.mp4"}
     assert photos[0].image.shape == (64, 96, 3)
     assert photos[0].image[:, ::8].mean() - photos[0].image[:, 4::8].mean() > 120.0
-    assert len(load_photos(tmp_path / "clip.mp4", frames=1000)) == MIN_FRAMES  # a still video
+    assert len(read_photos(tmp_path / "clip.mp4", frames=1000)) == MIN_FRAMES  # a still video
 
 
 def test_a_video_of_one_frame_is_one_photo(tmp_path):
     write_video(tmp_path / "clip.mp4", film(1, {0}))
-    assert [photo.name for photo in load_photos(tmp_path)] == ["clip.mp4/000000.png"]
+    assert [photo.name for photo in read_photos(tmp_path)] == ["clip.mp4/000000.png"]
     with pytest.raises(IgsrError, match=r"at least 2 photos; there is only clip\.mp4/000000\.png"):
         igsr.find_cameras(tmp_path, "colmap")
 
@@ -252,7 +252,7 @@ def test_video_is_turned_by_its_header(tmp_path):
     at = data.index(b"tkhd") + 4 + 40
     data[at : at + 36] = struct.pack(">9i", 0, 1 << 16, 0, -1 << 16, 0, 0, 64 << 16, 0, 1 << 30)
     path.write_bytes(data)
-    image = load_photos(path, frames=2)[0].image
+    image = read_photos(path, frames=2)[0].image
     assert image.shape == (96, 64, 3)
     assert image[:40].mean() < 30.0
     assert image[56:].mean() > 220.0
@@ -263,8 +263,8 @@ def test_damaged_videos(tmp_path):
     write_video(path, film(40, {3}))
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
-    assert 1 <= len(load_photos(path, frames=4)) <= 4  # the readable part
+    assert 1 <= len(read_photos(path, frames=4)) <= 4  # the readable part
     for content in (b"", b"no video", whole[:100]):
         path.write_bytes(content)
         with pytest.raises(IgsrError, match=r"clip\.avi (cannot be read as a video|has no frame)"):
-            load_photos(path)
+            read_photos(path)

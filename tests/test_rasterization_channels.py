@@ -45,9 +45,9 @@ def test_each_channel_equals_a_render_of_it_alone(channels, per_camera, packed, 
     picture, alpha, _ = run(scene, backgrounds=backgrounds, packed=packed, backend=backend)
     assert picture.shape == (2, HEIGHT, WIDTH, channels)
     for channel in range(channels):
-        grey = {**scene, "colors": scene["colors"][..., [channel] * 3]}
+        gray = {**scene, "colors": scene["colors"][..., [channel] * 3]}
         behind = backgrounds[:, [channel] * 3]
-        alone, alone_alpha, _ = run(grey, backgrounds=behind, packed=packed, backend=backend)
+        alone, alone_alpha, _ = run(gray, backgrounds=behind, packed=packed, backend=backend)
         assert torch.equal(picture[..., channel], alone[..., 0])
         assert torch.equal(alpha, alone_alpha)
 

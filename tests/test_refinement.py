@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from made_up_tracks import projected, tracked
 from refinements import contented, lying, refine, same, truthful, unsure
 
 import igsr
@@ -14,10 +15,10 @@ from igsr.cameras import find
 from igsr.fitting import presets
 from igsr.fitting.photo_statistics import photo_statistics
 from igsr.fitting.presets import settings_for
-from igsr.refinement import cross_validation, rounds
+from igsr.refinement import cross_validation, refine_photos, rounds
 from igsr.refinement.cross_validation import combined_error, fold_photos
 from igsr.refinement.results import Stop, StopReason
-from igsr.refinement.selection import LEAST_CONFIDENCE, select_views
+from igsr.refinement.selection import MIN_CONFIDENCE, select_views
 
 SEEDS = range(5)
 #: Stages of a refinement's events.
@@ -87,9 +88,10 @@ def test_after_a_rejected_round_the_first_fit_remains(few_photos, helped, render
 
 
 def test_without_a_selected_view_nothing_is_fitted_again(few_photos, helped, monkeypatch):
-    monkeypatch.setattr(rounds, "refit", lambda *_: pytest.fail("it was fitted again"))
+    for module in (rounds, refine_photos):
+        monkeypatch.setattr(module, "refit", lambda *_: pytest.fail("it was fitted again"))
     doubted, unchanged = (refine(few_photos, "auto", denoiser) for denoiser in (unsure, contented))
-    assert all(view.mean_confidence < LEAST_CONFIDENCE for view in doubted.rejected)
+    assert all(view.mean_confidence < MIN_CONFIDENCE for view in doubted.rejected)
     assert all(view.gain == 0.0 for view in unchanged.rejected)
     for refined in (doubted, unchanged):
         assert refined.rounds == []
@@ -127,6 +129,28 @@ def test_folds_are_fitted_with_the_settings_for_all_photos(ball_photos, monkeypa
     refine(ball_photos, 1, lying, steps=40)
     assert [count for count, *_ in fits][:4] == [9, 7, 8, 8]
     assert {tuple(settings) for _, *settings in fits} == {("original", 2, dropout)}
+
+
+def test_tracks_are_in_pixels_of_the_halved_photos(ball_photos, monkeypatch):
+    monkeypatch.setattr(cross_validation, "MIN_FOLD_SIDE_PX", 10)
+    xyz = np.random.default_rng(0).uniform(-0.4, 0.4, (30, 3))
+    photos = replace(ball_photos, points=tracked(ball_photos.views, xyz))
+    sizes = set()
+    fit_capture = rounds.fit_capture
+
+    def watched(capture, **given):
+        tracks = capture.points.tracks
+        for view in capture.views:
+            if view.name in tracks.names:
+                shown = tracks.view == tracks.names.index(view.name)
+                at = projected(view.camera, xyz[tracks.point[shown]])
+                assert np.abs(tracks.xy[shown] - at).max() < 1e-9
+                sizes.add(view.camera.width)
+        return fit_capture(capture, **given)
+
+    monkeypatch.setattr(rounds, "fit_capture", watched)
+    refine(photos, 1, lying, steps=10)
+    assert sizes == {40, 10}
 
 
 def test_pixels_behind_masks_get_no_weight(ball_photos):

@@ -12,8 +12,8 @@ from igsr.denoiser import Buffers
 from igsr.denoiser.confidence import HALF_CONFIDENCE_ERROR
 from igsr.refinement.novel_views import NovelView
 from igsr.refinement.selection import (
-    LEAST_CONFIDENCE,
-    LEAST_GAIN,
+    MIN_CONFIDENCE,
+    MIN_GAIN,
     PHOTO_ERROR,
     confidence_weights,
     denoised_candidate,
@@ -58,9 +58,7 @@ def test_the_largest_gain_first_and_none_without_confidence_or_gain():
         VIEW, Buffers(picture), [], cleaning(picture, np.ones((8, 8), np.float32))
     )
     known = [replace(one, gain=gain) for gain in (0.1, 0.3, 0.2)]
-    doubtful = replace(
-        one, gain=0.9, confidence=np.full((8, 8), 0.9 * LEAST_CONFIDENCE, np.float32)
-    )
+    doubtful = replace(one, gain=0.9, confidence=np.full((8, 8), 0.9 * MIN_CONFIDENCE, np.float32))
     assert [view.gain for view in select_views([*known, doubtful], 2)] == [0.3, 0.2]
-    right = replace(one, gain=0.9 * LEAST_GAIN)
+    right = replace(one, gain=0.9 * MIN_GAIN)
     assert select_views([doubtful, right], 2) == []

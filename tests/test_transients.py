@@ -384,6 +384,21 @@ def test_ctrl_c_saves_a_fit_that_started_over(visited, tmp_path, monkeypatch):
     assert checkpoints.load_checkpoint(path)[0]["step"] == [20]
 
 
+@pytest.mark.usefixtures("single_steps")
+def test_a_fit_that_started_over_is_saved_at_once(visited, tmp_path, monkeypatch):
+    monkeypatch.setattr(train, "CHECKPOINT_STEPS", 30)
+    monkeypatch.setattr(train, "CHECKPOINT_SECONDS", 1e9)
+    saved, save = [], checkpoints.CheckpointFile.save
+
+    def watched(file, state, *others):
+        saved.append(int(state["step"][0]))
+        save(file, state, *others)
+
+    monkeypatch.setattr(checkpoints.CheckpointFile, "save", watched)
+    fit(visited, checkpoint=tmp_path / "checkpoint.npz")
+    assert saved[:3] == [30, 1, 31]
+
+
 def test_an_interrupted_search_is_repeated(visited, whole, tmp_path, monkeypatch):
     path = tmp_path / "checkpoint.npz"
 

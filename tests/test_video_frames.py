@@ -8,7 +8,7 @@ import pytest
 from test_photo_folder import write_video
 
 from igsr.capture import video_frames
-from igsr.capture.photo_folder import load_photos
+from igsr.capture.photo_folder import read_photos
 from igsr.capture.video_frames import MIN_FRAMES, CameraPath, evenly_sharp, sharpest_frames
 from igsr.errors import IgsrError
 
@@ -111,7 +111,7 @@ def test_photos_of_a_stop_and_go_video(tmp_path):
     chosen = [index for index, _ in sharpest_frames(tmp_path / "walk.mp4", 100)]
     assert len(chosen) == pytest.approx(300 / STEP, abs=2)
     assert sum(32 < index < 108 for index in chosen) <= 1
-    names = [photo.name for photo in load_photos(tmp_path)]
+    names = [photo.name for photo in read_photos(tmp_path)]
     assert names == [f"walk.mp4/{index:06d}.png" for index in chosen]
 
 
@@ -122,4 +122,4 @@ def test_hdr_video_is_refused_by_name(tmp_path, monkeypatch):
     assert plain not in video_frames.HDR
     monkeypatch.setattr(video_frames, "HDR", {plain: "HLG"})
     with pytest.raises(IgsrError, match=r"walk\.mp4 is HDR video \(HLG\); save it as SDR"):
-        load_photos(tmp_path)
+        read_photos(tmp_path)

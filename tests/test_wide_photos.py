@@ -19,7 +19,7 @@ from PIL.PngImagePlugin import PngInfo
 import igsr
 from igsr.capture import Capture, load_capture
 from igsr.capture.load import look_at
-from igsr.capture.photo_folder import load_photos
+from igsr.capture.photo_folder import read_photos
 from igsr.capture.rig import moved_to_side, rig_of
 from igsr.capture.undistort import Lens
 from igsr.capture.wide_photos import (
@@ -281,10 +281,10 @@ def test_a_narrow_fisheye_stays_one_photo(tmp_path, stands, degrees, count):
 def test_a_lens_file_makes_photos_fisheye(tmp_path, stands, fisheye):
     save(tmp_path / "a.png", fisheye)
     save(tmp_path / "b.png", fisheye[:100])  # of another camera
-    assert len(load_photos(tmp_path)) == 2
+    assert len(read_photos(tmp_path)) == 2
     fields = {"camera_model": "OPENCV_FISHEYE", "w": 2 * SIZE, "h": 2 * SIZE, "fl_x": 2 * FOCAL}
     write_json(tmp_path / "lens.json", fields)
-    photos = load_photos(tmp_path)
+    photos = read_photos(tmp_path)
     assert [photo.name for photo in photos] == [f"a.png/{side}.png" for side in SHOWN] + ["b.png"]
     assert 0.5 < photos[1].mask.mean() < 0.65
     camera = photos[1].place.camera
@@ -297,7 +297,7 @@ def test_a_lens_file_makes_photos_fisheye(tmp_path, stands, fisheye):
     ):
         write_json(tmp_path / "lens.json", fields | wrong)
         with pytest.raises(IgsrError, match=f"lens.json.*{words}"):
-            load_photos(tmp_path)
+            read_photos(tmp_path)
 
 
 # --- recognition --------------------------------------------------------------------------------
@@ -376,7 +376,7 @@ def test_panoramas_in_a_folder_of_photos(tmp_path, panoramas):
     info = PngInfo()
     info.add_itxt("XML:com.adobe.xmp", xmp("cubestrip"))
     Image.fromarray(panoramas[1]).save(tmp_path / "d.png", pnginfo=info)
-    photos = load_photos(tmp_path)
+    photos = read_photos(tmp_path)
     assert Counter(photo.name[0] for photo in photos) == {"a": 6, "b": 1, "c": 6, "d": 1}
     first = photos[0]
     assert (first.name, first.place.rig) == ("a.png/front.png", "a.png")
@@ -384,7 +384,7 @@ def test_panoramas_in_a_folder_of_photos(tmp_path, panoramas):
     np.testing.assert_array_equal(photos[6].image, plain)
     overview = look_at(tmp_path)
     assert (len(overview.sizes), overview.views, overview.train_photos(2)) == (14, [6, 1, 6, 1], 2)
-    small = load_photos(tmp_path, max_size=40)[0]
+    small = read_photos(tmp_path, max_size=40)[0]
     assert (small.image.shape, small.full_size) == ((40, 40, 3), first.full_size)
 
 
@@ -396,7 +396,7 @@ def test_a_damaged_panorama_is_named(tmp_path, panoramas):
     (tmp_path / "a.jpg").write_bytes(data[: len(data) // 2])
     assert panorama_of(tmp_path / "a.jpg") is None
     with pytest.warns(UserWarning, match=r"a\.jpg is truncated"):
-        assert len(load_photos(tmp_path)) == 12
+        assert len(read_photos(tmp_path)) == 12
 
 
 # --- cameras --------------------------------------------------------------------------------

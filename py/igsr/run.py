@@ -49,6 +49,8 @@ class Run:
                 raise IgsrError(f"out is {self.out}, and {existing} is a file; name a folder.")
         self.resume = resume
         self.parts = Parts()
+        #: Whether a person or a program follows the events.
+        self.is_followed = bool(listeners)
         self._listeners = list(listeners)
 
     def add_listener(self, listener: Listener) -> None:
@@ -67,11 +69,6 @@ class Run:
     def wrote(self, stage: str, path: Path) -> None:
         """Report a file that now exists."""
         self.report(Event(stage, 1.0, path=path))
-
-    @property
-    def is_followed(self) -> bool:
-        """Whether anything listens."""
-        return bool(self._listeners)
 
 
 @contextlib.contextmanager

@@ -178,7 +178,7 @@ def write_block_page(
         "beside_text": f"{text}.",
         "beside_views": beside(views),
         "cameras": drawn_cameras([(PHOTO, train), (ADDED, test)], train),
-        "not_registered": [],
+        "not_placed": [],
         "parts": part_rows(report["parts"], {}),
         "peak_memory": report["peak_memory_bytes"],
         "backend": f"{report['backend']} ({report['instruction_set']})",

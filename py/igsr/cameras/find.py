@@ -24,8 +24,8 @@ from igsr.capture.photo_folder import (
     FRAMES,
     MIN_PHOTOS,
     Photo,
-    load_photos,
-    photo_headers,
+    pixel_sizes,
+    read_photos,
     reduced_photo,
 )
 from igsr.errors import IgsrError
@@ -36,7 +36,7 @@ AUTO = "auto"
 #: Longest side of the photos that estimators are given, pixels.
 MAX_SIDE_PX = 1600
 #: Version of each estimator's method; raise it to find kept cameras again.
-METHODS = {"colmap": 3, "da3": 2, AUTO: 1}
+METHODS = {"colmap": 3, "da3": 2, "dust3r": 1, AUTO: 1}
 
 Source: TypeAlias = str | os.PathLike[str] | Sequence[str | os.PathLike[str] | Photo]
 
@@ -85,7 +85,8 @@ class CameraSettings:
         }
         return {
             "estimator": self.estimator,
-            "method": METHODS.get(self.estimator, 1),
+            # "auto" runs the others.
+            "method": dict(METHODS) if self.estimator == AUTO else METHODS.get(self.estimator, 1),
             "seed": self.seed,
             "frames": self.frames,
             "options": plain,
@@ -158,7 +159,7 @@ def estimated_cameras(
     """
     settings.check()
     if isinstance(photos, (str, os.PathLike)):
-        photo_headers(photos, settings.frames).check_memory(max_size)
+        pixel_sizes(photos, settings.frames).check_memory(max_size)
     loaded, left_out = split_unfit(photos_of(photos, settings.frames, MAX_SIDE_PX))
     if len(loaded) < MIN_PHOTOS and left_out:
         raise IgsrError(
@@ -222,10 +223,10 @@ def photos_of(photos: Source, frames: int = FRAMES, max_size: int | None = None)
         max_size: longest side of the photos as loaded, pixels, or None.
 
     Raises:
-        IgsrError: as ``load_photos``, or the list mixes files with ``Photo`` or has a name twice.
+        IgsrError: as ``read_photos``, or the list mixes files with ``Photo`` or has a name twice.
     """
     if isinstance(photos, (str, os.PathLike)):
-        return load_photos(photos, frames, max_size)
+        return read_photos(photos, frames, max_size)
     loaded = [photo for photo in photos if isinstance(photo, Photo)]
     files = [photo for photo in photos if not isinstance(photo, Photo)]
     if loaded and files:
@@ -234,7 +235,7 @@ def photos_of(photos: Source, frames: int = FRAMES, max_size: int | None = None)
         raise IgsrError("photos holds two photos of one name; give each its own")
     if loaded:
         return [reduced_photo(photo, max_size) for photo in loaded]
-    return load_photos(files, frames, max_size)
+    return read_photos(files, frames, max_size)
 
 
 def photos_at(
@@ -247,7 +248,7 @@ def photos_at(
         loaded: the photos at some size, used if that is the size wanted. The list is emptied.
 
     Raises:
-        IgsrError: as ``load_photos``.
+        IgsrError: as ``read_photos``.
     """
     if loaded is None or not all(_is_at(photo, max_size) for photo in loaded):
         if loaded is not None:

@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from igsr._internal.event import CAMERAS_FOUND
 from igsr._internal.part_usage import Meter
@@ -17,7 +18,7 @@ from igsr.cameras.registry import ESTIMATORS, NETWORKS
 from igsr.capture import Capture, load_capture
 from igsr.capture.downscaling import check_max_size
 from igsr.capture.load import Overview, look_at
-from igsr.capture.photo_folder import photo_sizes
+from igsr.capture.photo_folder import file_sizes
 from igsr.errors import IgsrError
 from igsr.run import Run
 
@@ -63,7 +64,7 @@ def load_photos(
         run: measures "cameras" and "load".
         settings: how to find cameras.
         holdout: hold out every Nth photo for testing, or None.
-        max_size: longest side of photos as loaded, pixels, or None.
+        max_size: longest side of photos as loaded, pixels, or None. A capture keeps its sizes.
         announce: called before slow work with what the path holds, and whether its cameras are
             known.
 
@@ -72,9 +73,11 @@ def load_photos(
             options are given for photos that have cameras.
     """
     if isinstance(photos, Capture):
+        if settings is not None and (settings.options or settings.estimator != AUTO):
+            raise IgsrError("photos is a capture, which has cameras; leave out the estimator")
         return LoadedPhotos(photos if holdout is None else photos.with_holdout(holdout))
     settings = settings or CameraSettings()
-    path = Path(photos)
+    path = _checked_path(photos)
     check_max_size(max_size)
     settings.check()
     seen = look_at(path, settings.frames, max_size)
@@ -95,7 +98,7 @@ def load_photos(
     if kept is None:
         meter = Meter()
         found, loaded = estimated_cameras(path, settings, run.report, max_size)
-        kept = KeptCameras(found, photo_sizes(path), meter.lap())
+        kept = KeptCameras(found, file_sizes(path), meter.lap())
         if run.out is not None:
             write_cameras_file(run.out / CAMERAS_FILE, kept)
             run.wrote(CAMERAS_FOUND, run.out / CAMERAS_FILE)
@@ -111,6 +114,13 @@ def load_photos(
     if holdout is not None:
         capture = capture.with_holdout(holdout)
     return LoadedPhotos(capture, kept.found.not_placed, cameras_found=True)
+
+
+def _checked_path(photos: Any) -> Path:
+    if not isinstance(photos, (str, os.PathLike)):
+        kind = type(photos).__name__
+        raise IgsrError(f"photos must be a capture, a folder or a video, not {kind}")
+    return Path(photos)
 
 
 def check_enough_placed(found: FoundCameras, settings: CameraSettings) -> None:
@@ -149,7 +159,7 @@ def _kept_cameras(photos: Path, run: Run, settings: CameraSettings) -> KeptCamer
         return None
     if run.resume:
         kept = read_cameras_file(file)
-        if kept.photos != photo_sizes(photos):
+        if kept.photos != file_sizes(photos):
             raise IgsrError(
                 f"{file} has the cameras of other photos than {photos} holds now; resume with the "
                 "same photos or leave resume out."
@@ -159,7 +169,7 @@ def _kept_cameras(photos: Path, run: Run, settings: CameraSettings) -> KeptCamer
         kept = read_cameras_file(file)
     except IgsrError:
         return None
-    if kept.photos != photo_sizes(photos) or kept.found.made_by != settings.made_by():
+    if kept.photos != file_sizes(photos) or kept.found.made_by != settings.made_by():
         return None
     could_place_more = (
         settings.estimator == AUTO

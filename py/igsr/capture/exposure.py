@@ -35,7 +35,7 @@ class Exposure:
         if min(self.gain) <= 0.0:
             raise IgsrError(f"gain must be three numbers above 0, not {list(self.gain)}.")
 
-    def given_to(
+    def apply_to(
         self,
         colors: npt.NDArray[np.float32],
         alpha: npt.NDArray[np.float32] | None = None,
@@ -60,7 +60,7 @@ class Exposure:
         kept = (1.0 - alpha[..., None]) * behind
         return np.asarray((colors - kept) * gain + offset * alpha[..., None] + kept, np.float32)
 
-    def taken_out_of(self, image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    def remove_from(self, image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
         """Convert a photo to the scene's colors, clipped to 8 bits.
 
         Args:

@@ -13,7 +13,7 @@ from pathlib import Path
 from igsr.capture.downscaling import check_max_size
 from igsr.capture.image_files import SUFFIXES, is_file
 from igsr.capture.memory_check import PhotoSizes
-from igsr.capture.photo_folder import FRAMES, has_photos, photo_headers
+from igsr.capture.photo_folder import FRAMES, has_photos, pixel_sizes
 from igsr.capture.photos import DescribedCapture, checked_headers, shot_sizes
 from igsr.capture.read_colmap import describe_colmap, find_model, reduction_of
 from igsr.capture.read_transforms import describe_split_transforms, describe_transforms
@@ -163,5 +163,5 @@ def look_at(
         sizes = shot_sizes(shots, checked_headers(shots))
         train = sum(shot.split == "train" for shot in shots)
         return Overview(path=path, has_cameras=True, train=train, **vars(sizes))
-    sizes = photo_headers(path, frames)
+    sizes = pixel_sizes(path, frames)
     return Overview(path=path, has_cameras=False, train=len(sizes.sizes), **vars(sizes))

@@ -159,14 +159,14 @@ def check_photos(views: list[View]) -> None:
     if len(empty) == len(views):
         raise IgsrError("Every photo is black or fully transparent; there is nothing to fit.")
     if empty:
-        _warn(f"{listed(empty)}: black or fully transparent; leave these photos out.")
+        warn_user(f"{listed(empty)}: black or fully transparent; leave these photos out.")
     shots = [view for view in views if not isinstance(view, PseudoView)]
     photos = ((view.photo, view.image, view.mask) for view in shots)
     blurred = sorted(blurred_photos(photos))
     if blurred:
-        _warn(f"{listed(blurred)}: blurred; leave out photos that others show sharp.")
+        warn_user(f"{listed(blurred)}: blurred; leave out photos that others show sharp.")
     if len(views) == 1:
-        _warn(
+        warn_user(
             "There is one photo only, which does not determine distances: the scene is right from "
             "that camera alone."
         )
@@ -176,23 +176,19 @@ def check_photos(views: list[View]) -> None:
     if not np.isfinite(farthest):
         return  # reported when the splats are placed
     if farthest == 0.0:
-        _warn(
+        warn_user(
             "All cameras are at one place, which does not determine distances: the scene is right "
             "from there alone."
         )
         return
     pair = _same_cameras(views, centers, _ONE_PLACE * farthest)
     if pair:
-        _warn(f"{listed(pair)} have the same camera; the second photo adds nothing.")
+        warn_user(f"{listed(pair)} have the same camera; the second photo adds nothing.")
     if not _any_two_share(views, farthest):
-        _warn(
+        warn_user(
             "No two photos see anything in common, which leaves distances open; check the poses, "
             "or add photos between these."
         )
-
-
-def _warn(sentence: str) -> None:
-    warn_user(sentence)
 
 
 def _is_empty(view: View) -> bool:

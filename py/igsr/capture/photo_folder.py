@@ -95,7 +95,7 @@ class Photo:
         return self.taken or (self.image.shape[1], self.image.shape[0])
 
 
-def load_photos(path: Paths, frames: int = FRAMES, max_size: int | None = None) -> list[Photo]:
+def read_photos(path: Paths, frames: int = FRAMES, max_size: int | None = None) -> list[Photo]:
     """Load photos without cameras.
 
     Args:
@@ -171,8 +171,8 @@ def has_photos(path: Path) -> bool:
         return False
 
 
-def photo_sizes(path: Path) -> dict[str, int]:
-    """Return the size in bytes of each photo and video that ``load_photos`` would load, by name.
+def file_sizes(path: Path) -> dict[str, int]:
+    """Return the size in bytes of each photo and video that ``read_photos`` would load, by name.
 
     A ``lens.json`` counts too, since cameras depend on it.
     """
@@ -214,8 +214,6 @@ def _find_files(path: Paths) -> tuple[Path, list[Path], Path]:
             raise IgsrError(f"{folder} does not exist or is no folder; give a folder of photos")
         root = _photo_root(folder)
         files = sorted(_walk(root), key=lambda file: file.relative_to(root).as_posix())
-    except IgsrError:
-        raise
     except (OSError, ValueError) as error:
         raise IgsrError(f"{folder} cannot be read; give a folder of photos") from error
     if not files:
@@ -244,8 +242,8 @@ def _listed_files(files: list[Path]) -> tuple[Path, list[Path], Path]:
     return root, files, root / "masks"
 
 
-def photo_headers(path: Paths, frames: int = FRAMES) -> PhotoSizes:
-    """Return the sizes of the photos that ``load_photos`` would load.
+def pixel_sizes(path: Paths, frames: int = FRAMES) -> PhotoSizes:
+    """Return the sizes of the photos that ``read_photos`` would load.
 
     Pixels are decoded only of photos that may be panoramas. The photos count as masked, since it is
     unknown whether their lenses distort.

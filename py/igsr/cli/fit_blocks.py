@@ -45,14 +45,14 @@ def fit_blocks(
     """
     from igsr._internal.progress_bar import progress_bar
     from igsr.blocks import BlockOptions, fit_in_blocks
-    from igsr.fitting.fitter import check_fits
+    from igsr.fitting.fitter import fit_device
     from igsr.fitting.presets import default_max_size
 
     try:
         count = None if blocks == "auto" else int(blocks)
     except ValueError:
         raise IgsrError(f"--blocks must be auto or a whole number, not {blocks!r}.") from None
-    name = check_fits(backend)["backend"]
+    name = fit_device(backend)["backend"]
     options = BlockOptions(
         blocks=count,
         ray=ray,

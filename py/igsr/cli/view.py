@@ -34,7 +34,6 @@ ENVIRONMENT = {"PYTHONSAFEPATH": "1"}
 WITHOUT_WINDOW = ("--screenshot", "--frames", "--time", "--help", "-h", "--version")
 OWN_HOST = "127.0.0.1"
 #: Unknown options are the viewer's.
-PASSED_ON = {"ignore_unknown_options": True}
 #: Longest side of the photos for the viewer.
 MAX_PHOTO_SIDE_PX = 1600
 

@@ -34,7 +34,7 @@ from igsr.compaction.validation import (
     self_validation,
 )
 from igsr.errors import IgsrError
-from igsr.fitting.fitter import check_fits
+from igsr.fitting.fitter import fit_device
 from igsr.run import open_run
 from igsr.splats import MAX_SH_DEGREE, Splats
 
@@ -109,7 +109,7 @@ def compact(
         RuntimeError: backend "gpu" was asked for and no adapter answers.
     """
     _check_arguments(max_loss, capture, psnr, sh_degree, steps, seed, background)
-    info = check_fits(backend)
+    info = fit_device(backend)
     if splats.antialiased:
         raise IgsrError("Antialiased splats cannot be compacted: fits render without antialiasing.")
     name = _core.resolve_backend(backend)

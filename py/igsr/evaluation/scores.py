@@ -164,7 +164,7 @@ def render_of(
     picture = render(splats, view.camera, background, backend)
     if view.exposure is not None:
         alpha = picture.alpha if view.image.shape[2] == 4 else None
-        color = view.exposure.given_to(picture.color, alpha, tuple(background))
+        color = view.exposure.apply_to(picture.color, alpha, tuple(background))
         picture = replace(picture, color=color)
     return picture.to_uint8()
 

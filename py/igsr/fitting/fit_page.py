@@ -70,7 +70,7 @@ def write_fit_page(
         "beside_text": "Held-out photos." if held_out else "Fitted photos; none is held out.",
         "beside_views": beside(shown),
         "cameras": drawn_cameras([(PHOTO, train), (ADDED, test)], train),
-        "not_registered": report["photos"]["not_placed"],
+        "not_placed": report["photos"]["not_placed"],
         "parts": part_rows(report["parts"], PARTS),
         "peak_memory": report["peak_memory_bytes"],
         "version": report["version"],

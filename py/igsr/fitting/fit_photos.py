@@ -23,7 +23,7 @@ from igsr.evaluation.scores import default_background
 from igsr.fitting.announcement import announcement
 from igsr.fitting.fit_capture import fit_capture
 from igsr.fitting.fit_report import fit_report, score_fit, write_fit_report
-from igsr.fitting.fitter import check_fits
+from igsr.fitting.fitter import fit_device
 from igsr.fitting.followed_run import FollowedRun
 from igsr.fitting.presets import Quality, default_max_size
 from igsr.fitting.result import FitResult
@@ -120,7 +120,7 @@ def fit(
         seed: random seed.
         backend: "auto" (a real GPU if there is one, else the CPU), "cpu" or "gpu".
         holdout: hold out every Nth photo for testing, such as 8.
-        max_size: longest side of photos as fitted, pixels; larger ones are reduced. By default
+        max_size: longest side of photos as loaded, pixels; larger ones are reduced. By default
             1000 on the CPU and 1600 on a GPU, times 0.6 or 1.6 for quality "draft" or "high".
         estimator: finds cameras if the photos have none, as ``igsr.find_cameras``.
         estimator_options: of the estimator.
@@ -156,7 +156,7 @@ def fit(
     }
     named = {} if isinstance(start, Splats) else {"start": start}
     chosen = checked_given(FitSettings, given | named)
-    name = check_fits(backend)["backend"]
+    name = fit_device(backend)["backend"]
     max_size = default_max_size(name, quality) if max_size is None else max_size
     cameras = CameraSettings(estimator, dict(estimator_options or {}), seed, frames, allow_missing)
     loading: dict[str, Any] = {"holdout": holdout, "max_size": max_size}
@@ -184,7 +184,7 @@ def fit(
                 backend=name,
                 checkpoint=None if run.out is None else run.out / CHECKPOINT,
                 resume=resume,
-                report=run.report if run.is_followed else None,
+                report=run.report,
                 **given,
             )
         result = replace(result, not_placed=tuple(loaded.not_placed))
@@ -203,7 +203,7 @@ def fit(
             "background": None if background is None else list(background),
             "igsr": _core.__version__,
         }
-        return _written(run, run.out, result, color, asked, cameras_found=loaded.cameras_found)
+        return _write(run, run.out, result, color, asked, cameras_found=loaded.cameras_found)
 
 
 def _announce(
@@ -233,7 +233,7 @@ def _announce(
             run.note(sentence)
 
 
-def _written(
+def _write(
     run: Run,
     out: Path,
     result: FitResult,

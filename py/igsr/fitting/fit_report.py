@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -111,7 +111,6 @@ def fit_report(
     held_out = scores.psnr if scores.protocol["split"] == "test" else None
     refined = None if scored.refined is None else scored.refined["psnr"]
     parts = run.parts.plain()
-    views = result.capture.views
     return {
         **{metric: scores[metric] for metric in METRICS},
         **({} if scored.refined is None else {"refined": scored.refined}),
@@ -127,13 +126,7 @@ def fit_report(
         "parts": parts,
         "peak_memory_bytes": total(parts).peak_memory_bytes,
         "exposures": {name: exposure.plain() for name, exposure in result.exposures.items()},
-        "photos": {
-            "given": len(views) + len(result.not_placed),
-            "placed": len(views),
-            "train": len(result.capture.train_views),
-            "test": len(result.capture.test_views),
-            "not_placed": list(result.not_placed),
-        },
+        "photos": photo_counts(result.capture, result.not_placed),
         **result.device,
         "seed": result.settings.seed,
         "version": _core.__version__,
@@ -141,6 +134,17 @@ def fit_report(
         "settings": dict(asked),
         "protocol": scores.protocol,
         "views": scores.views,
+    }
+
+
+def photo_counts(capture: Capture, not_placed: Sequence[str]) -> dict[str, Any]:
+    """Numbers of photos by their use, and the names of those without a camera."""
+    return {
+        "given": len(capture.views) + len(not_placed),
+        "placed": len(capture.views),
+        "train": len(capture.train_views),
+        "test": len(capture.test_views),
+        "not_placed": list(not_placed),
     }
 
 

@@ -79,7 +79,7 @@ def _rigs(views: Sequence[View]) -> list[int] | None:
     return [names[view.photo] for view in views]
 
 
-def check_fits(backend: str) -> dict[str, str]:
+def fit_device(backend: str) -> dict[str, str]:
     """Return "backend", "device" and "instruction_set" of a backend that fits.
 
     Raises:
@@ -220,7 +220,7 @@ def fitted_exposures(views: Sequence[View], fitter: _core.Fitter) -> list[Exposu
 def without_exposures(views: Sequence[View], exposures: Sequence[Exposure | None]) -> list[View]:
     """The views with exposures removed from their pixels."""
     return [
-        view if one is None else replace(view, image=one.taken_out_of(view.image), exposure=None)
+        view if one is None else replace(view, image=one.remove_from(view.image), exposure=None)
         for view, one in zip(views, exposures, strict=True)
     ]
 

@@ -13,7 +13,7 @@ from igsr.capture.photo_checks import check_photos
 from igsr.errors import IgsrError
 from igsr.fitting.depth_checks import with_consistent_depths, with_scaled_depths
 from igsr.fitting.exposures import StartingExposures, starting_exposures
-from igsr.fitting.fitter import check_fits, without_exposures
+from igsr.fitting.fitter import fit_device, without_exposures
 from igsr.fitting.photo_statistics import PhotoStatistics, photo_statistics
 from igsr.fitting.pose_priors import PosePriors, pose_priors
 from igsr.fitting.presets import Quality, settings_for
@@ -115,7 +115,7 @@ def prepare(
         capture = replace(capture, views=with_consistent_depths(scaled))
         views = capture.train_views
     _check_focal(views, settings)
-    device = check_fits(backend)
+    device = fit_device(backend)
     priors = None
     if settings.moves_cameras:
         joint = settings.poses != "fixed"

@@ -136,7 +136,7 @@ def detail_of_files(files: Sequence[Path], max_size: int | None) -> float:
         max_size: longest side of photos as fitted, pixels, or None.
     """
     from igsr.capture.downscaling import reduced_size
-    from igsr.capture.photos import decoded, open_image
+    from igsr.capture.image_files import decoded, open_image
     from igsr.errors import IgsrError
 
     details = []

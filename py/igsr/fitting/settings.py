@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
 
-from igsr._internal.settings import about, checked, settings_of, validate
+from igsr._internal.settings import about, validate
 from igsr.errors import IgsrError
 
 Density: TypeAlias = Literal["mcmc", "original", "fixed"]
@@ -81,12 +81,3 @@ class FitSettings:
         if self.background is not None:
             values["background"] = list(self.background)
         return values
-
-
-def check_whole_number(name: str, value: object) -> None:
-    """Check one whole-number setting, such as "steps" or "seed".
-
-    Raises:
-        IgsrError: the value is not a whole number or is out of range.
-    """
-    checked(settings_of(FitSettings)[name], value)

@@ -83,7 +83,7 @@ class Trained:
 
 
 @dataclass
-class _Beginning:
+class _Start:
     """Where the optimization begins: at the first step, or where a checkpoint was saved."""
 
     state: Arrays
@@ -118,20 +118,20 @@ def train(
         IgsrError: the checkpoint or the photos cannot be used, or a step fails.
         RuntimeError: the GPU failed; the last checkpoint stays.
     """
-    began = time.perf_counter()
-    begin = _resumed(inputs, file) if resume and file is not None else None
+    started_at = time.perf_counter()
+    start = _resumed(inputs, file) if resume and file is not None else None
     if file is not None:
         file.check_writable()
-    is_new = begin is None
-    if begin is None:
-        begin = _begun(inputs, report, began)
-    settings, masks, looked_at = inputs.settings, begin.masks, begin.looked_at
-    kept: Arrays = {"origin": begin.origin}
+    is_new = start is None
+    if start is None:
+        start = _new_start(inputs, report, started_at)
+    settings, masks, looked_at = inputs.settings, start.masks, start.looked_at
+    kept: Arrays = {"origin": start.origin}
     if settings.moves_cameras:
-        kept[ROUGH_CAMERAS] = camera_rows(begin.views)
+        kept[ROUGH_CAMERAS] = camera_rows(start.views)
 
     def fitter_from(state: Arrays) -> _core.Fitter:
-        views = masked_views(begin.views, masks)
+        views = masked_views(start.views, masks)
         values = {
             **settings.plain(),
             "first_step": settings.first_step,
@@ -139,20 +139,20 @@ def train(
         }
         try:
             return fitter_of(
-                views, begin.origin, state, values, inputs.backend, inputs.priors, inputs.exposures
+                views, start.origin, state, values, inputs.backend, inputs.priors, inputs.exposures
             )
         except ValueError as error:
             raise IgsrError(f"{error}.") from error
 
     try:
-        fitter = fitter_from(begin.state)
+        fitter = fitter_from(start.state)
     except IgsrError as error:
         if resume and file is not None:
             raise IgsrError(f"The checkpoint {file.path} cannot be used: {error}") from error
         raise
 
-    looks = steps_to_look(settings, begin.views)
-    loop = _Loop(inputs, begin, file, report)
+    looks = steps_to_look(settings, start.views)
+    loop = _Loop(inputs, start, file, report)
     loop.at(fitter, masks, looked_at, kept)
     if is_new and settings.moves_cameras and inputs.initial is None:
         loop.save()  # finding the rough cameras took long
@@ -162,9 +162,9 @@ def train(
             is_off = settings.transients == "auto" and looked_at >= 0 and not any_masked(masks)
             if step in looks and looked_at < step and not is_off:
                 new_masks = look_for_transients(
-                    fitter, begin.views, begin.origin, masks, settings, inputs.backend
+                    fitter, start.views, start.origin, masks, settings, inputs.backend
                 )
-                state = _after_look(inputs, begin, fitter, masks, new_masks, loop)
+                state = _after_look(inputs, start, fitter, masks, new_masks, loop)
                 masks, looked_at = new_masks, step
                 if state is not None:
                     fitter = fitter_from(state)
@@ -176,16 +176,16 @@ def train(
         loop.save_new()
         raise
 
-    splats = Splats(**fitter.splats(), origin=begin.origin, antialiased=False)
-    cameras = [view.camera for view in begin.views]
+    splats = Splats(**fitter.splats(), origin=start.origin, antialiased=False)
+    cameras = [view.camera for view in start.views]
     if settings.moves_cameras:
-        cameras = fitted_cameras(begin.views, fitter, begin.origin)
-    exposures: list[Exposure | None] = [None] * len(begin.views)
+        cameras = fitted_cameras(start.views, fitter, start.origin)
+    exposures: list[Exposure | None] = [None] * len(start.views)
     if inputs.exposures is not None:
-        exposures = fitted_exposures(begin.views, fitter)
+        exposures = fitted_exposures(start.views, fitter)
     return Trained(
         splats,
-        begin.views,
+        start.views,
         cameras,
         exposures,
         masks,
@@ -196,7 +196,7 @@ def train(
     )
 
 
-def _begun(inputs: FitInputs, report: Listener | None, began: float) -> _Beginning:
+def _new_start(inputs: FitInputs, report: Listener | None, started_at: float) -> _Start:
     """The first splats; joint fits first find the cameras roughly."""
     capture, settings = inputs.capture, inputs.settings
     if settings.moves_cameras and inputs.initial is None:
@@ -210,8 +210,8 @@ def _begun(inputs: FitInputs, report: Listener | None, began: float) -> _Beginni
         state |= with_splats_after(state, inputs.frozen)
     origin = state.pop("origin")
     views = capture.train_views
-    seconds = time.perf_counter() - began if settings.moves_cameras else 0.0
-    return _Beginning(state, origin, views, [None] * len(views), -1, started, seconds)
+    seconds = time.perf_counter() - started_at if settings.moves_cameras else 0.0
+    return _Start(state, origin, views, [None] * len(views), -1, started, seconds)
 
 
 def _rough(inputs: FitInputs, fitter: _core.Fitter, steps: int, report: Listener | None) -> None:
@@ -224,7 +224,7 @@ def _rough(inputs: FitInputs, fitter: _core.Fitter, steps: int, report: Listener
             report(fit_event(0, inputs.settings, size, done["loss"], done["splats"], rate))
 
 
-def _resumed(inputs: FitInputs, file: CheckpointFile) -> _Beginning:
+def _resumed(inputs: FitInputs, file: CheckpointFile) -> _Start:
     """Where the checkpoint was saved.
 
     Raises:
@@ -239,12 +239,12 @@ def _resumed(inputs: FitInputs, file: CheckpointFile) -> _Beginning:
         masks, looked_at = masks_from_arrays(views, state)
     except ValueError as error:
         raise IgsrError(f"The checkpoint {file.path} cannot be used: {error}.") from error
-    return _Beginning(state, origin, views, masks, looked_at, started, seconds)
+    return _Start(state, origin, views, masks, looked_at, started, seconds)
 
 
 def _after_look(
     inputs: FitInputs,
-    begin: _Beginning,
+    start: _Start,
     fitter: _core.Fitter,
     masks: Masks,
     new_masks: Masks,
@@ -253,7 +253,7 @@ def _after_look(
     """The state to continue from once masks changed; None if the fitter stays."""
     if not any_masked(new_masks) and not any_masked(masks):
         return None
-    views = masked_views(begin.views, new_masks)
+    views = masked_views(start.views, new_masks)
     may_start_over = not inputs.settings.moves_cameras and inputs.initial is None
     if may_start_over and not any_masked(masks):
         try:
@@ -263,11 +263,11 @@ def _after_look(
             pass
         else:
             origin = state.pop("origin")
-            state["means"] = state["means"] + (origin - begin.origin).astype(np.float32)
+            state["means"] = state["means"] + (origin - start.origin).astype(np.float32)
             loop.started = started
             return state
-    splats = Splats(**fitter.splats(), origin=begin.origin, antialiased=False)
-    cameras = fitted_cameras(begin.views, fitter, begin.origin)
+    splats = Splats(**fitter.splats(), origin=start.origin, antialiased=False)
+    cameras = fitted_cameras(start.views, fitter, start.origin)
     keep = visible_splats(splats, cameras, new_masks, inputs.frozen_count, inputs.backend)
     return _selected(fitter.state(), keep)
 
@@ -291,18 +291,18 @@ class _Loop:
     def __init__(
         self,
         inputs: FitInputs,
-        begin: _Beginning,
+        start: _Start,
         file: CheckpointFile | None,
         report: Listener | None,
     ) -> None:
         self.inputs, self.file, self.report = inputs, file, report
-        self.started, self.loss = begin.started, math.nan
-        self._seconds_before = begin.seconds
+        self.started, self.loss = start.started, math.nan
+        self._seconds_before = start.seconds
         self._began = self._saved_at = time.perf_counter()
         self._chunk = 1
-        self._names = [view.name for view in begin.views]
-        self.size = _mean_size(begin.views)
-        self._views = begin.views
+        self._names = [view.name for view in start.views]
+        self.size = _mean_size(start.views)
+        self._views = start.views
         self._saved_step: int | None = None
 
     def at(self, fitter: _core.Fitter, masks: Masks, looked_at: int, kept: Arrays) -> None:
@@ -341,7 +341,8 @@ class _Loop:
                 raise
         step, saved = int(self.fitter.steps_done), self._saved_step or 0
         is_late = time.perf_counter() - self._saved_at >= CHECKPOINT_SECONDS
-        if step - saved >= CHECKPOINT_STEPS or is_late:
+        # A fit that started over has fewer steps than its checkpoint.
+        if not 0 <= step - saved < CHECKPOINT_STEPS or is_late:
             self.save()
 
     def save(self) -> None:

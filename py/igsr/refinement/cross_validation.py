@@ -13,7 +13,7 @@ from igsr.capture import View
 from igsr.capture.downscaling import halved
 from igsr.evaluation.scores import ScoredView, score_views
 from igsr.refinement import rounds
-from igsr.refinement.results import HELD_OUT_SIDE, HeldOutView
+from igsr.refinement.results import HELD_OUT_SIDE_PX, HeldOutView
 from igsr.refinement.rounds import NOVEL_VIEWS_WORK, Context, Reconstruction
 from igsr.refinement.selection import Candidate, Rejected
 
@@ -123,7 +123,7 @@ def fit_folds(context: Context, photos: Sequence[View]) -> list[Fold]:
 def validate(context: Context, folds: Sequence[Fold]) -> tuple[Validation, list[Fold]]:
     """Let each fold do the round; return the verdict and the folds after it."""
     proposals = [(fold, *_denoised(context, fold.fitted)) for fold in folds]
-    selections = [rounds.select(context, novel) for _, novel, _ in proposals]
+    selections = [rounds.select_candidates(context, novel) for _, novel, _ in proposals]
     not_added = [view for _, others in selections for view in others]
     count = sum(len(selected) for selected, _ in selections)
     if not count:
@@ -152,8 +152,8 @@ def combined_error(scores: dict[str, float]) -> float:
 
 def _denoised(context: Context, fitted: Reconstruction) -> tuple[list[Candidate], list[Candidate]]:
     """Novel views of a fold, and those that it added before, denoised."""
-    novel = rounds.propose(context, fitted)
-    candidates = rounds.denoise(context, fitted, [*novel, *fitted.added])
+    novel = rounds.propose_views(context, fitted)
+    candidates = rounds.denoise_views(context, fitted, [*novel, *fitted.added])
     return candidates[: len(novel)], candidates[len(novel) :]
 
 
@@ -169,10 +169,15 @@ def _scored(context: Context, fitted: Reconstruction, held_out: list[View]) -> l
     return scored
 
 
+def _score(view: ScoredView, name: str) -> float:
+    score = view.scores[name]
+    assert score is not None, "only ms_ssim may be None"
+    return float(score)
+
+
 def _means(views: Sequence[ScoredView]) -> dict[str, float]:
     return {
-        name: float(np.mean([float(view.scores[name] or 0.0) for view in views]))
-        for name in DECIDING_SCORES
+        name: float(np.mean([_score(view, name) for view in views])) for name in DECIDING_SCORES
     }
 
 
@@ -183,8 +188,8 @@ def _compared(before: Sequence[ScoredView], after: Sequence[ScoredView]) -> list
             old.photo,
             old.render,
             new.render,
-            float(old.scores["psnr"] or 0.0),
-            float(new.scores["psnr"] or 0.0),
+            _score(old, "psnr"),
+            _score(new, "psnr"),
         )
         for old, new in zip(before, after, strict=True)
     ]
@@ -192,7 +197,7 @@ def _compared(before: Sequence[ScoredView], after: Sequence[ScoredView]) -> list
 
 def _small(picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
     image = Image.fromarray(picture)
-    image.thumbnail((HELD_OUT_SIDE, HELD_OUT_SIDE), Image.Resampling.BOX)
+    image.thumbnail((HELD_OUT_SIDE_PX, HELD_OUT_SIDE_PX), Image.Resampling.BOX)
     return np.asarray(image)
 
 

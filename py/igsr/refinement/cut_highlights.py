@@ -1,8 +1,7 @@
-"""Highlights that photos cut to white, in photos whose exposures are taken out.
+"""Clipped highlights of photos whose exposures are removed.
 
-A cut channel tells that the scene is at least so bright. With a bright photo's exposure taken out
-it would be grey, and tell that the sky is. The fit that found the exposures knows it as a lower
-bound, and other photos showed it how bright the scene is there.
+A clipped channel is a lower bound of the brightness. Removing the exposure of a bright photo would
+turn a white sky gray. The fit that estimated the exposures has the brightness from other photos.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from igsr.capture import View
 from igsr.rendering.renders import render
 from igsr.splats import Splats
 
-#: The level of a channel that is cut.
+#: Value of a clipped channel.
 CUT = 255
 
 
@@ -28,13 +27,13 @@ def with_cut_highlights(
     background: Sequence[float],
     backend: Backend = "auto",
 ) -> list[View]:
-    """The photos, with cut channels at least as bright as the fit shows them.
+    """Raise clipped channels of photos to the brightness of the fit.
 
     Args:
-        photos: with their exposures taken out.
-        views: the same, as they were taken, with their exposures (``View.exposure``) and cameras.
-        splats: the fit that found the exposures.
-        background: RGB in [0, 1], behind the render.
+        photos: with their exposures removed.
+        views: the original photos with their exposures (``View.exposure``) and cameras.
+        splats: the fit that estimated the exposures.
+        background: RGB in [0, 1] behind the render.
         backend: "auto", "cpu", "gpu" or "reference".
     """
     return [
@@ -48,7 +47,7 @@ def _lifted(
 ) -> View:
     cut = view.image[..., :3] == CUT
     if view.image.shape[2] == 4:
-        cut &= view.image[..., 3:] == 255  # behind the others is a background of any color
+        cut &= view.image[..., 3:] == 255  # other pixels show a random background
     if not cut.any():
         return photo
     shown = render(splats, view.camera, background, backend).to_uint8()

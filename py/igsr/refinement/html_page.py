@@ -27,33 +27,25 @@ from igsr.evaluation.report_page import (
 )
 from igsr.evaluation.scores import ScoredView, default_background, over_background
 from igsr.refinement.novel_views import NovelView
-from igsr.refinement.results import HELD_OUT_SIDE, HeldOutView, Refined
-from igsr.refinement.selection import LEAST_CONFIDENCE, LEAST_GAIN, Candidate, Rejected
+from igsr.refinement.progress import STAGE_NAMES
+from igsr.refinement.results import HELD_OUT_SIDE_PX, HeldOutView, Refined
+from igsr.refinement.selection import MIN_CONFIDENCE, MIN_GAIN, Candidate, Rejected
 
-#: Longest side of pictures on the page, pixels.
-THUMBNAIL, PICTURE = 160, 320
-#: Stages as the page calls them.
-STAGES = {
-    "cameras": "find cameras",
-    "load": "load photos",
-    "fit": "fit the photos",
-    "cross_validate": "cross-validate",
-    "novel_views": "render and denoise novel views",
-    "refit": "refit with novel views",
-    "test": "score the test views",
-}
+#: Longest side of photos and of novel views on the page, pixels.
+THUMBNAIL_PX, VIEW_PX = 160, 320
+STAGES = {"cameras": "find cameras", "load": "load photos", **STAGE_NAMES}
 
 
 def write_page(
     path: Path, refined: Refined, report: dict[str, Any], shown: Sequence[ScoredView] = ()
 ) -> None:
-    """Write the page, whole or not at all; it needs nothing but a browser.
+    """Write the page, whole or not at all.
 
     Args:
-        path: where to.
-        refined: what the page shows.
-        report: of ``report.json``.
-        shown: views that are shown beside their renders.
+        path: of the page.
+        refined: the refinement.
+        report: the content of ``report.json``.
+        shown: views to show next to their renders.
 
     Raises:
         IgsrError: the file cannot be written.
@@ -68,11 +60,11 @@ def write_page(
         "photos": [
             {
                 "name": view.name,
-                "picture": jpeg(over_background(view.image, background), THUMBNAIL),
+                "picture": jpeg(over_background(view.image, background), THUMBNAIL_PX),
             }
             for view in refined.capture.train_views
         ],
-        "not_registered": report["not_registered"],
+        "not_placed": report["photos"]["not_placed"],
         "splats": len(refined.splats),
         "stop": refined.stop,
         "score_rows": _score_rows(refined),
@@ -93,8 +85,8 @@ def write_page(
             for done in refined.rounds
         ],
         "rejected": _rejected(refined.rejected),
-        "least_confidence": LEAST_CONFIDENCE,
-        "least_gain": LEAST_GAIN,
+        "least_confidence": MIN_CONFIDENCE,
+        "least_gain": MIN_GAIN,
         "limit": None if report["limit"] is None else report["limit"]["sentence"],
         "beside_text": "Test views." if refined.capture.test_views else "Photos that were fitted.",
         "beside_views": beside(shown),
@@ -143,9 +135,9 @@ def _selected(candidate: Candidate) -> dict[str, Any]:
         "place": _place(candidate.view),
         "gain": candidate.gain,
         "mean_confidence": candidate.mean_confidence,
-        "render": jpeg(candidate.render, PICTURE),
-        "denoised": jpeg(candidate.denoised, PICTURE),
-        "confidence": jpeg(confidence, PICTURE),
+        "render": jpeg(candidate.render, VIEW_PX),
+        "denoised": jpeg(candidate.denoised, VIEW_PX),
+        "confidence": jpeg(confidence, VIEW_PX),
     }
 
 
@@ -154,9 +146,9 @@ def _held_out(view: HeldOutView) -> dict[str, Any]:
         "name": view.name,
         "psnr_before": view.psnr_before,
         "psnr_after": view.psnr_after,
-        "photo": jpeg(view.photo, HELD_OUT_SIDE),
-        "before": jpeg(view.before, HELD_OUT_SIDE),
-        "after": jpeg(view.after, HELD_OUT_SIDE),
+        "photo": jpeg(view.photo, HELD_OUT_SIDE_PX),
+        "before": jpeg(view.before, HELD_OUT_SIDE_PX),
+        "after": jpeg(view.after, HELD_OUT_SIDE_PX),
     }
 
 
@@ -174,7 +166,7 @@ def _place(view: NovelView) -> str:
 
 
 def _cameras(refined: Refined) -> list[tuple[int, list[list[float]]]]:
-    """What the page's script draws; place and size are those of the known cameras."""
+    """Cameras that the page's script draws; photos and added views determine the frame."""
     photos = [view.camera for view in refined.capture.train_views]
     added = [one.view.camera for done in refined.rounds if done.accepted for one in done.selected]
     rejected = [one.view.camera for one in _last_rejected(refined)]
@@ -183,7 +175,7 @@ def _cameras(refined: Refined) -> list[tuple[int, list[list[float]]]]:
 
 
 def _last_rejected(refined: Refined) -> Sequence[Rejected]:
-    """Views that the last round did not add, or those of the one that was not begun."""
+    """Views that the last round did not add."""
     if refined.rejected or not refined.rounds:
         return refined.rejected
     return refined.rounds[-1].rejected

@@ -1,4 +1,4 @@
-"""The photos near novel views, as the denoiser looks them up: a bounded number in memory."""
+"""Photos near a novel view as inputs of the denoiser, with a bounded number in memory."""
 
 from __future__ import annotations
 
@@ -12,15 +12,14 @@ from igsr.capture import Camera, View
 from igsr.denoiser import Source, photo_sources
 from igsr.splats import Splats
 
-#: Photos that a novel view is denoised with, at most: those whose cameras are nearest. The denoiser
-#: looks up fewer.
+#: Maximum number of photos for a novel view, the nearest ones. The denoiser uses fewer.
 NEAR = 24
-#: Photos held at a time: novel views that follow each other share most of theirs.
-HELD = 32
+#: Photos kept in memory; successive novel views share them.
+CACHED = 32
 
 
 class NearSources:
-    """Sources of photos near a camera, made when they are first asked for."""
+    """Sources of the photos near a camera, made on first use."""
 
     def __init__(
         self,
@@ -29,7 +28,7 @@ class NearSources:
         background: Sequence[float],
         backend: Backend,
     ) -> None:
-        """Keep what is given; nothing is rendered yet.
+        """Keep the arguments; nothing is rendered yet.
 
         Args:
             splats: the scene fitted to the photos.
@@ -40,7 +39,7 @@ class NearSources:
         self._splats, self._photos = splats, photos
         self._background, self._backend = background, backend
         self._centers = np.stack([photo.camera.center for photo in photos])
-        self._held: OrderedDict[int, Source] = OrderedDict()
+        self._cached: OrderedDict[int, Source] = OrderedDict()
 
     def of(self, camera: Camera) -> list[Source]:
         """The sources of at most ``NEAR`` photos, in the order of the photos."""
@@ -49,10 +48,10 @@ class NearSources:
         return [self._source(k) for k in near]
 
     def _source(self, k: int) -> Source:
-        if k not in self._held:
+        if k not in self._cached:
             one = photo_sources(self._splats, [self._photos[k]], self._background, self._backend)
-            self._held[k] = one[0]
-            if len(self._held) > HELD:
-                self._held.popitem(last=False)
-        self._held.move_to_end(k)
-        return self._held[k]
+            self._cached[k] = one[0]
+            if len(self._cached) > CACHED:
+                self._cached.popitem(last=False)
+        self._cached.move_to_end(k)
+        return self._cached[k]

@@ -1,9 +1,9 @@
-"""Novel views: cameras near the photos' cameras, which look at what these look at.
+"""Novel views: new cameras near the photos' cameras, with the same targets.
 
-Around each known camera, candidates are eight ways to lean out by ``STEP`` degrees about the point
-that it looks at, and the middle between it and each other camera nearby. A candidate is novel if it
-is not close to a known camera. Views between known cameras come first, then those beyond them. The
-cameras of views that a round adds are known in the next round, which so reaches further out.
+Each known camera gives eight candidates at ``STEP`` degrees from it, on a circle around its target,
+and the middle between it and each nearby camera. A candidate is novel if no known camera is close.
+Views between known cameras come first. The views that a round adds are known cameras in the next
+round, so each round reaches further out.
 """
 
 from __future__ import annotations
@@ -16,26 +16,27 @@ import numpy.typing as npt
 
 from igsr._internal.choices import Backend
 from igsr.capture import Camera
+from igsr.capture.downscaling import resized_camera
 from igsr.rendering.renders import render
 from igsr.splats import Splats
 
 Float64 = npt.NDArray[np.float64]
 
-#: Degrees from a known camera to a novel view, about what they look at.
+#: Angle from a known camera to a novel view, seen from their target, degrees.
 STEP = 12.0
-#: A view nearer to a known camera than this part of a step is not novel.
-LEAST_STEP = 0.6
-#: Two cameras further apart than this, degrees, have nothing known between them.
+#: A view closer to a known camera than this fraction of ``STEP`` is not novel.
+MIN_STEP = 0.6
+#: No view is placed between two cameras that are further apart than this, degrees.
 GAP = 60.0
-#: Directions to lean out in.
+#: Candidates around each known camera.
 DIRECTIONS = 8
-#: A view is inside the scene, or behind something, where more than this share of its pixels is
-#: nearer than ``CLOSE`` times the distance to what it looks at.
-CLOSE_SHARE, CLOSE = 0.1, 0.35
-#: A pixel of less alpha than this shows no surface.
+#: A view is inside or behind an object if more than this fraction of its pixels is closer than
+#: ``CLOSE`` times the distance to its target.
+CLOSE_FRACTION, CLOSE = 0.1, 0.35
+#: Minimum alpha of a pixel that shows a surface.
 SURFACE_ALPHA = 0.5
-#: Longer side, in pixels, of the small renders that tell where surfaces are.
-DEPTH_RENDER_SIDE = 96
+#: Longer side of the renders whose depths are used, pixels.
+DEPTH_SIDE_PX = 96
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +46,8 @@ class NovelView:
     Attributes:
         camera: pinhole camera with the size and focal length of the known camera that it was
             derived from.
-        angle: degrees to the nearest known camera, about what that looks at.
-        between: whether it lies between known cameras, not beyond them.
+        angle: degrees to the nearest known camera, seen from that camera's target.
+        between: whether it is between known cameras, not beyond them.
     """
 
     camera: Camera
@@ -57,17 +58,17 @@ class NovelView:
 def novel_views(
     splats: Splats, known: Sequence[Camera], count: int, backend: Backend = "auto"
 ) -> list[NovelView]:
-    """Cameras near known ones but not at them, spread out, and never inside the scene.
+    """Place cameras near known ones, apart from each other and outside of objects.
 
     Args:
         splats: the scene so far.
         known: cameras of the photos, and of views that earlier rounds added.
-        count: most views that are returned.
+        count: maximum number of views.
         backend: "auto", "cpu", "gpu" or "reference".
 
     Returns:
-        Those between known cameras first; in each group the ones farthest from all others first.
-        Fewer than ``count``, or none, where there is no more room for them.
+        First views between known cameras; in each group, those farthest from all others first.
+        Fewer than ``count``, or none, if there is no more room.
     """
     distances = [_viewing_distance(splats, camera, backend) for camera in known]
     looking = [
@@ -80,9 +81,9 @@ def novel_views(
     found: list[tuple[NovelView, float]] = []
     for k, (camera, distance) in enumerate(looking):
         others = [one for i, (one, _) in enumerate(looking) if i != k]
-        for candidate, reach, between in _neighbourhood(camera, distance, others):
+        for candidate, reach, between in _neighborhood(camera, distance, others):
             angle = float(_angles(targets, centers, candidate.center).min())
-            if angle >= LEAST_STEP * STEP:
+            if angle >= MIN_STEP * STEP:
                 found.append((NovelView(candidate, angle, between), reach))
     chosen: list[NovelView] = []
     for between in (True, False):
@@ -103,18 +104,18 @@ def _add_farthest(
 
     Args:
         chosen: views so far, at most ``count`` in the end.
-        group: views, each with its distance to what it looks at.
-        count: most views that are chosen.
+        group: views, each with the distance to its target.
+        count: maximum number of chosen views.
         centers: [N, 3] centers of the known cameras, world.
-        splats: the scene, which no view may stand inside of.
-        backend: what renders.
+        splats: the scene.
+        backend: of the renders.
     """
     new = np.array([view.camera.center for view in chosen]).reshape(-1, 3)
     around = np.concatenate([centers, new])
     apart = np.array(
         [_angles(_target(v.camera, d), v.camera.center, around).min() for v, d in group]
     )
-    while len(chosen) < count and len(apart) and apart.max() >= LEAST_STEP * STEP:
+    while len(chosen) < count and len(apart) and apart.max() >= MIN_STEP * STEP:
         best = int(np.argmax(apart))
         view, reach = group[best]
         apart[best] = 0.0
@@ -127,10 +128,10 @@ def _add_farthest(
             apart[i] = min(apart[i], float(away))
 
 
-def _neighbourhood(
+def _neighborhood(
     camera: Camera, distance: float, others: Sequence[Camera]
 ) -> list[tuple[Camera, float, bool]]:
-    """Cameras around one, each one's distance to what it looks at, and whether it is between."""
+    """Candidates around a camera, with distance to the target and whether each is between."""
     out = []
     for other in others:
         gap = _angle(camera, other, distance)
@@ -148,7 +149,7 @@ def _target(camera: Camera, distance: float) -> Float64:
 
 
 def _leaning(camera: Camera, distance: float, right: float, down: float) -> Camera:
-    """The camera turned by a step about what it looks at, towards a side of its own picture."""
+    """The camera rotated around its target by ``STEP``, towards a side of its image."""
     target = _target(camera, distance)
     rotation = camera.viewmat[:3, :3]
     away = -rotation[2]
@@ -159,7 +160,7 @@ def _leaning(camera: Camera, distance: float, right: float, down: float) -> Came
 
 
 def _towards(camera: Camera, other: Camera, distance: float, part: float) -> tuple[Camera, float]:
-    """A camera on the arc between two, about what the first looks at, and its distance to that."""
+    """A camera on the arc between two around the first one's target, and its distance to that."""
     target = _target(camera, distance)
     there = other.center - target
     far = float(np.linalg.norm(there))
@@ -173,7 +174,7 @@ def _towards(camera: Camera, other: Camera, distance: float, part: float) -> tup
 
 
 def _looking(camera: Camera, center: Float64, target: Float64, down: Float64) -> Camera:
-    """A camera like another, at a place, looking at a target, its y axis nearest to a given one."""
+    """A copy of a camera at ``center`` that looks at ``target``, with its y axis near ``down``."""
     forward = (target - center) / np.linalg.norm(target - center)
     right = np.cross(down, forward)
     if np.linalg.norm(right) < 1e-6:
@@ -186,7 +187,7 @@ def _looking(camera: Camera, center: Float64, target: Float64, down: Float64) ->
 
 
 def _angle(camera: Camera, other: Camera, distance: float) -> float:
-    """Degrees between where two cameras stand, seen from what the first looks at."""
+    """Degrees between two camera centers, seen from the first camera's target."""
     return float(_angles(_target(camera, distance), camera.center, other.center))
 
 
@@ -200,24 +201,21 @@ def _angles(target: Float64, center: Float64, others: Float64) -> Float64:
 
 
 def _small(camera: Camera) -> Camera:
-    """The same camera with a small picture."""
-    scale = min(1.0, DEPTH_RENDER_SIDE / max(camera.width, camera.height))
+    """The same camera with a small image."""
+    scale = min(1.0, DEPTH_SIDE_PX / max(camera.width, camera.height))
     width, height = max(1, round(scale * camera.width)), max(1, round(scale * camera.height))
-    K = camera.K.copy()
-    K[0] *= width / camera.width
-    K[1] *= height / camera.height
-    return replace(camera, K=K, width=width, height=height)
+    return resized_camera(camera, width, height)
 
 
 def _viewing_distance(splats: Splats, camera: Camera, backend: Backend) -> float | None:
-    """Median depth of what a camera sees; None where it sees nothing."""
+    """Median depth of the surfaces that a camera sees; None if it sees none."""
     seen = render(splats, _small(camera), backend=backend)
     depths = seen.expected_depth[seen.alpha > SURFACE_ALPHA]
     return float(np.median(depths)) if len(depths) else None
 
 
 def _is_outside(splats: Splats, camera: Camera, distance: float, backend: Backend) -> bool:
-    """Whether a camera stands in front of the scene: few pixels are close, some show a surface."""
+    """Whether few pixels of a camera are close and some show a surface."""
     seen = render(splats, _small(camera), backend=backend)
     near = (seen.alpha > SURFACE_ALPHA) & (seen.expected_depth < CLOSE * distance)
-    return bool(near.mean() <= CLOSE_SHARE and (seen.alpha > SURFACE_ALPHA).any())
+    return bool(near.mean() <= CLOSE_FRACTION and (seen.alpha > SURFACE_ALPHA).any())

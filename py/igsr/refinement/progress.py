@@ -8,7 +8,7 @@ from igsr.refinement.results import Stage
 from igsr.run import Run
 
 #: Stages as events name them.
-STAGE_NAMES: dict[Stage, str] = {
+STAGE_NAMES: dict[str, str] = {
     "fit": "fit photos",
     "cross_validate": "cross-validate",
     "novel_views": "denoise novel views",

@@ -29,12 +29,11 @@ from igsr.denoiser import Denoiser, NetworkDenoiser, load_network
 from igsr.errors import IgsrError
 from igsr.evaluation.scores import check_masks, default_background
 from igsr.fitting.announcement import announcement
-from igsr.fitting.fitter import check_fits
+from igsr.fitting.fitter import fit_device
 from igsr.fitting.followed_run import FollowedRun
 from igsr.fitting.photo_statistics import photo_statistics
 from igsr.fitting.presets import Quality, default_max_size
 from igsr.fitting.settings import ExposureMode, TransientMode
-from igsr.refinement import rounds as steps_of_rounds
 from igsr.refinement.cross_validation import (
     MIN_PHOTOS,
     Fold,
@@ -53,9 +52,13 @@ from igsr.refinement.rounds import (
     Propose,
     Reconstruction,
     Select,
+    denoise_views,
     fit_all,
     make_context,
+    propose_views,
+    refit,
     score_test_views,
+    select_candidates,
 )
 from igsr.refinement.selection import Rejected, select_views
 from igsr.refinement.settings import AUTO, RefineSettings
@@ -137,7 +140,7 @@ def refine(
         transients=transients,
         quality=quality,
     )
-    name: Any = check_fits(backend)["backend"]
+    name: Any = fit_device(backend)["backend"]
     max_size = default_max_size(name, quality) if max_size is None else max_size
     cameras = CameraSettings(estimator, dict(estimator_options or {}), seed, frames, allow_missing)
     denoiser = denoiser or round_denoiser()
@@ -180,7 +183,7 @@ def refine(
             resume,
             RefineProgress(run, _work(capture, settings)),
         )
-        return _refined(context, run, tuple(loaded.not_placed))
+        return _run_rounds(context, run, tuple(loaded.not_placed))
 
 
 def round_denoiser(weights: str | os.PathLike[str] | None = None) -> NetworkDenoiser:
@@ -197,14 +200,24 @@ def round_denoiser(weights: str | os.PathLike[str] | None = None) -> NetworkDeno
     return NetworkDenoiser(load_network(weights), doubt=0.0)
 
 
-def _refined(context: Context, run: Run, not_placed: tuple[str, ...]) -> Refined:
+def _run_rounds(context: Context, run: Run, not_placed: tuple[str, ...]) -> Refined:
     """Fit all photos, and do rounds until one is rejected or none is left."""
     context, whole = fit_all(context)
     test = score_test_views(context, whole.shown)
-    refined = Refined(whole.shown, whole.shown, test, context.capture, [], None, [], {}, not_placed)
+    refined = Refined(
+        splats=whole.shown,
+        first=whole.shown,
+        first_test=test,
+        capture=context.capture,
+        rounds=[],
+        stop=None,
+        rejected=[],
+        seconds={},
+        not_placed=not_placed,
+    )
     folds: list[Fold] = []
-    while refined.stop is None:
-        refined = _written(context, run, refined)
+    while True:
+        refined = _write(context, run, refined)
         context.progress.round += 1
         stop = _stop_before(context, whole)
         if stop is not None:
@@ -223,17 +236,17 @@ def _refined(context: Context, run: Run, not_placed: tuple[str, ...]) -> Refined
                 stop = Stop(StopReason.NOT_ACCEPTED, context.progress.round)
                 refined = replace(refined, stop=stop)
                 break
-        novel = steps_of_rounds.propose(context, whole)
-        candidates = steps_of_rounds.denoise(context, whole, [*novel, *whole.added])
+        novel = propose_views(context, whole)
+        candidates = denoise_views(context, whole, [*novel, *whole.added])
         again = candidates[len(novel) :]
-        selected, rejected = steps_of_rounds.select(context, candidates[: len(novel)])
+        selected, rejected = select_candidates(context, candidates[: len(novel)])
         if not selected:
             refined = _without_round(refined, rejected)
             break
-        whole = steps_of_rounds.refit(context, whole, selected, again, "refit")
+        whole = refit(context, whole, selected, again, "refit")
         test = score_test_views(context, whole.shown)
         refined = _with_round(refined, validated, selected, rejected, whole, test)
-    return _written(context, run, refined)
+    return _write(context, run, refined)
 
 
 def _stop_before(context: Context, whole: Reconstruction) -> Stop | None:
@@ -280,7 +293,7 @@ def _without_round(refined: Refined, rejected: list[Rejected]) -> Refined:
     return replace(refined, stop=stop, rejected=rejected)
 
 
-def _written(context: Context, run: Run, refined: Refined) -> Refined:
+def _write(context: Context, run: Run, refined: Refined) -> Refined:
     """Write the result so far, unless the folder already holds it; return it with its times."""
     seconds = {name: part["seconds"] for name, part in run.parts.plain().items()}
     refined = replace(refined, seconds=seconds)

@@ -1,9 +1,8 @@
-"""What a refinement leaves: models, added views, ``report.json`` and ``report.html``."""
+"""Files of a refinement: models, added views, ``report.json`` and ``report.html``."""
 
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
@@ -22,6 +21,7 @@ from igsr.evaluation.contact_sheet import contact_sheet, rounds_sheet, save_shee
 from igsr.evaluation.limits import limit_of
 from igsr.evaluation.quick_scores import mean_of, quick_views, train_photos, train_scores
 from igsr.evaluation.scores import ScoredView, default_background
+from igsr.fitting.fit_report import photo_counts
 from igsr.fitting.scene_files import write_scene
 from igsr.refinement.html_page import write_page
 from igsr.refinement.results import Refined, Round, Stage
@@ -30,31 +30,23 @@ from igsr.refinement.settings import RefineSettings
 from igsr.run import Run
 from igsr.splats import Splats
 
-#: Of ``report.json``. Format 1 had no number, other keys, and no settings.
-FORMAT = 2
-#: Files of a round; ``trust`` is what igsr 0.1 called the confidence weights.
-ROUND_FILES = (
-    "scene.ply",
-    "view-*.before.png",
-    "view-*.after.png",
-    "view-*.confidence.png",
-    "view-*.trust.png",
-)
+#: Format number of ``report.json``.
+FORMAT = 3
+#: Files of a round.
+ROUND_FILES = ("scene.ply", "view-*.before.png", "view-*.after.png", "view-*.confidence.png")
 
 
 def write_refinement(run: Run, refined: Refined, settings: RefineSettings) -> None:
-    """Write a refinement as it stands.
+    """Write the files of a refinement so far.
 
-    ``scene.ply`` is the last accepted model, ``cameras.json`` has the photos' cameras.
-    ``rounds/N/scene.ply`` is each round's model, 0 the fit to the photos alone;
-    ``rounds/N/view-K.{before,after,confidence}.png`` are the novel views that it added: rendered,
-    denoised, and their confidence weights, white for 1. Such files of an earlier run that this one
-    does not write are removed. ``views.png`` has test views before the first round and after the
-    last accepted one; photos, renders and errors where no round was accepted. Where there are no
-    test views, it has photos that were fitted.
+    * ``scene.ply``: the last accepted model; ``cameras.json``: the photos' cameras.
+    * ``rounds/N/scene.ply``: the model of each round; 0 is the fit to the photos alone.
+    * ``rounds/N/view-K.{before,after,confidence}.png``: the novel views that the round added:
+      renders, denoised renders and confidence weights (white is 1).
+    * ``views.png``: test views, or fitted photos if there are none, before the first round and
+      after the last accepted one; without an accepted round, photos, renders and errors.
 
-    What limits the scene, and the scores of fitted photos that say so, are found once the
-    refinement has ended.
+    Such files of an earlier run are removed. Scores of fitted photos are computed only at the end.
 
     Raises:
         IgsrError: a file cannot be written.
@@ -84,13 +76,13 @@ def report_of(
     parts: Mapping[str, Usage] | None = None,
     train: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """What ``report.json`` holds.
+    """Make the content of ``report.json``.
 
     Args:
         refined: the refinement.
-        settings: of it.
-        parts: what each stage took.
-        train: "psnr", "ssim", "views" and "of" of fitted photos, once they are scored.
+        settings: of the refinement.
+        parts: time and memory of each stage.
+        train: "psnr", "ssim", "views" and "of" of fitted photos, if they are scored.
     """
     accepted = [done.test for done in refined.rounds if done.accepted]
     test = [refined.first_test, *accepted][-1]
@@ -105,14 +97,13 @@ def report_of(
         "stop_reason": None if refined.stop is None else refined.stop.reason.value,
         "stopped": "" if refined.stop is None else str(refined.stop),
         "rejected": _view_rows(refined.rejected),
-        "seconds": {stage: round(seconds, 2) for stage, seconds in refined.seconds.items()},
+        "seconds": round(sum(refined.seconds.values()), 3),
         "parts": used,
         "peak_memory_bytes": total(used).peak_memory_bytes,
         "test": test,
         "train": train,
         "limit": limit,
-        "photos": [view.name for view in refined.capture.train_views],
-        "not_registered": list(refined.not_placed),
+        "photos": photo_counts(refined.capture, refined.not_placed),
         "splats": len(refined.splats),
         "settings": vars(settings),
         "seed": settings.seed,
@@ -121,29 +112,13 @@ def report_of(
     }
 
 
-def seconds_so_far(out: Path) -> dict[Stage, float]:
-    """What each stage took by the report in ``out``, of format 1 or 2; none if it has no such."""
-    stages: tuple[Stage, ...] = get_args(Stage)
-    seconds: dict[Stage, float] = {}
-    try:
-        found = json.loads((out / "report.json").read_text(encoding="utf-8"))["seconds"]
-        for stage in stages:
-            if stage in found:
-                seconds[stage] = float(found[stage])
-    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
-        return {}
-    return {stage: value for stage, value in seconds.items() if 0.0 <= value < math.inf}
-
-
 def parts_so_far(out: Path) -> dict[str, Usage]:
-    """What each stage took by the report in ``out``; of older reports its seconds alone."""
-    seconds = seconds_so_far(out)
+    """Read the time and memory of each stage from the report in ``out``; {} if there is none."""
     try:
         found = json.loads((out / "report.json").read_text(encoding="utf-8"))["parts"]
-        parts = {stage: Usage.of(found[stage]) for stage in seconds if stage in found}
+        return {stage: Usage.of(found[stage]) for stage in get_args(Stage) if stage in found}
     except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
-        parts = {}
-    return {stage: parts.get(stage, Usage(value, 0.0, None)) for stage, value in seconds.items()}
+        return {}
 
 
 def _round_row(done: Round) -> dict[str, Any]:
@@ -184,7 +159,7 @@ def _view_rows(views: Sequence[Candidate | Rejected]) -> list[dict[str, Any]]:
 
 
 def _scored(refined: Refined, backend: Backend) -> tuple[dict[str, Any] | None, list[ScoredView]]:
-    """Scores of fitted photos, once the refinement has ended, and the views that are shown."""
+    """Scores of fitted photos, None before the end, and the views to show."""
     capture = refined.capture
     background = default_background(capture)
 
@@ -206,7 +181,7 @@ def _scored(refined: Refined, backend: Backend) -> tuple[dict[str, Any] | None, 
 
 
 def _write_views(path: Path, refined: Refined, shown: list[ScoredView], backend: Backend) -> None:
-    """Views before the first round and after the last that was accepted, or with their errors."""
+    """Write ``views.png``."""
     if not any(done.accepted for done in refined.rounds):
         save_sheet(path, contact_sheet(shown))
         return

@@ -1,4 +1,4 @@
-"""What a refinement returns and reports, as data."""
+"""Results of a refinement."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ Stage = Literal["fit", "cross_validate", "novel_views", "refit", "test"]
 #: is not defined.
 MeanScores = dict[str, float | None]
 
-#: With fewer held-out photos, no standard error is told.
-FEWEST_FOR_ERROR = 3
-#: Longest side of the pictures of held-out photos, pixels.
-HELD_OUT_SIDE = 480
+#: Minimum number of held-out photos for a standard error.
+MIN_FOR_ERROR = 3
+#: Longest side of the images of held-out photos, pixels.
+HELD_OUT_SIDE_PX = 480
 
 
 class StopReason(enum.Enum):
@@ -44,14 +44,14 @@ class StopReason(enum.Enum):
 
 @dataclass(frozen=True)
 class Stop:
-    """Why a refinement ended; ``str`` of it is a message for people.
+    """Why a refinement ended; ``str(stop)`` is a message for people.
 
     Attributes:
-        reason: what ended it.
-        count: what the reason counts. ``ROUNDS_DONE``: the rounds. ``TOO_FEW_PHOTOS``: the photos
-            that cross-validation needs. ``ENOUGH_PHOTOS``: the photos that see the same place.
-            ``NONE_SELECTED``: the novel views that were rejected, of all folds.
-            ``NOT_ACCEPTED``: the number of the round that was not. ``NO_NOVEL_VIEW``: 0.
+        reason: the reason.
+        count: number of rounds (``ROUNDS_DONE``), of photos that cross-validation needs
+            (``TOO_FEW_PHOTOS``), of photos that see the same place (``ENOUGH_PHOTOS``) or of novel
+            views that were rejected in all folds (``NONE_SELECTED``); the rejected round
+            (``NOT_ACCEPTED``); 0 (``NO_NOVEL_VIEW``).
     """
 
     reason: StopReason
@@ -77,9 +77,9 @@ class HeldOutView:
 
     Attributes:
         name: of the photo.
-        photo: uint8 [H, W, 3], reduced to at most ``HELD_OUT_SIDE`` pixels, as are the renders.
-        before, after: uint8 [H, W, 3], before the fold's round and after it.
-        psnr_before, psnr_after: dB, at the size that the fold has.
+        photo: uint8 [H, W, 3], reduced to ``HELD_OUT_SIDE_PX``, like the renders.
+        before, after: uint8 [H, W, 3], renders before and after the fold's round.
+        psnr_before, psnr_after: dB, at the fold's image size.
     """
 
     name: str
@@ -92,21 +92,20 @@ class HeldOutView:
 
 @dataclass(frozen=True, eq=False)
 class Round:
-    """What one round did.
+    """One round.
 
     Attributes:
-        selected: novel views that were added, the one of the largest gain first. Views of earlier
-            rounds are not among them; they were rendered and denoised again. None of a round that
-            was not accepted: its folds alone did it.
+        selected: novel views that the round added, largest gain first; empty if the round was not
+            accepted, since only the folds did it.
         rejected: novel views that were rendered and not added.
         validation_before: mean scores ("psnr", "ssim", "flip") of the held-out photos of all
-            folds, before the round.
-        validation_after: the same after the round. Both are empty without cross-validation.
+            folds, before the round; empty without cross-validation.
+        validation_after: the same after the round.
         accepted: whether the geometric mean of root squared error, 1 - SSIM and FLIP of the
-            held-out photos fell; if not, folds alone did the round. True without cross-validation.
-        splats: after the round; None where it was not accepted.
-        test: mean scores of the capture's test views; they decide nothing. None where the round
-            was not accepted or there are no test views.
+            held-out photos fell. True without cross-validation.
+        splats: after the round; None if it was not accepted.
+        test: mean scores of the test views, which decide nothing. None if the round was not
+            accepted or there are no test views.
         held_out: the held-out photos of all folds; empty without cross-validation.
     """
 
@@ -121,17 +120,17 @@ class Round:
 
     @property
     def gain(self) -> tuple[float, float] | None:
-        """Mean gain of held-out photos' PSNR, dB, and its standard error; None of fewer than 3."""
+        """Mean PSNR gain of held-out photos, dB, and its standard error; None for less than 3."""
         gains = [view.psnr_after - view.psnr_before for view in self.held_out]
-        if len(gains) < FEWEST_FOR_ERROR or not np.isfinite(gains).all():
+        if len(gains) < MIN_FOR_ERROR or not np.isfinite(gains).all():
             return None
         return float(np.mean(gains)), float(np.std(gains, ddof=1) / np.sqrt(len(gains)))
 
     @property
     def verdict(self) -> str:
-        """Whether the gain is more than chance, as a sentence; empty where that is not known."""
+        """A sentence on the significance of the gain; empty if it is unknown."""
         count = len(self.held_out)
-        if 0 < count < FEWEST_FOR_ERROR:
+        if 0 < count < MIN_FOR_ERROR:
             return f"{count} held-out photos are too few to tell gain from chance."
         if self.gain is None:
             return ""
@@ -147,13 +146,12 @@ class Refined(ArrayEquality, NotebookPicture):
     Attributes:
         splats: after the last round that was accepted.
         first: after the fit to the photos alone, which is round 0.
-        first_test: mean scores of the capture's test views by ``first``, if it has any.
+        first_test: mean scores of ``first`` on the test views; None if there are none.
         capture: photos and cameras.
-        rounds: those that were tried, in order; only the last one can have been not accepted.
+        rounds: all rounds in order; only the last one may have been rejected.
         stop: why there was no further round; None while there may be one.
-        rejected: novel views of a round that was not begun, since none of them was selected: of
-            the folds, or, if these selected some, of the whole fit.
-        seconds: time of each stage by name, earlier runs that this one resumed included.
+        rejected: novel views of a last round that selected none.
+        seconds: time of each stage by name, with resumed earlier runs.
         not_placed: names of the photos whose cameras were not found.
     """
 

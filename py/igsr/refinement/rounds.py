@@ -15,6 +15,7 @@ import numpy as np
 from igsr._internal.choices import FitBackend
 from igsr._internal.event import Event
 from igsr.capture import Camera, Capture, PseudoView, View
+from igsr.capture.downscaling import resized_tracks
 from igsr.denoiser import Denoiser, photo_support, render_buffers
 from igsr.evaluation.scores import (
     METRICS,
@@ -184,20 +185,20 @@ def fit_all(context: Context) -> tuple[Context, Reconstruction]:
 def fit_photos(
     context: Context, name: str, photos: list[View], share: float, steps: float
 ) -> Reconstruction:
-    """Fit some photos; the arguments are those of the result."""
+    """Fit some photos; see ``Reconstruction`` for the arguments."""
     splats = _fit(context, name, "fit", photos, share, steps).splats
     shown = _with_backdrop(context, splats, photos)
     return Reconstruction(name, photos, share, steps, splats, shown)
 
 
-def propose(context: Context, fitted: Reconstruction) -> list[NovelView]:
+def propose_views(context: Context, fitted: Reconstruction) -> list[NovelView]:
     """Propose cameras of novel views."""
     context.progress.report("novel_views")
     known = [photo.camera for photo in fitted.photos] + [view.camera for view in fitted.added]
     return list(context.propose(fitted.splats, known, CANDIDATES, context.backend))
 
 
-def denoise(
+def denoise_views(
     context: Context, fitted: Reconstruction, views: Sequence[NovelView]
 ) -> list[Candidate]:
     """Render and denoise novel views."""
@@ -214,7 +215,7 @@ def denoise(
     return candidates
 
 
-def select(
+def select_candidates(
     context: Context, candidates: Sequence[Candidate]
 ) -> tuple[list[Candidate], list[Rejected]]:
     """Select the candidates to add; return them and the others."""
@@ -305,8 +306,12 @@ def _fit(
         work = share * steps * event.done / event.total
         context.progress.report(stage, work, event.message)
 
+    whole = context.capture
+    sizes = {view.name: view.camera for view in whole.views}
+    # Folds have halved photos.
+    points = resized_tracks(whole.points, sizes, {view.name: view.camera for view in views})
     result = fit_capture(
-        Capture(context.capture.path, views, context.capture.points),
+        Capture(whole.path, views, points),
         report=report,
         backend=context.backend,
         checkpoint=checkpoint,

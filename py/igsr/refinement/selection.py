@@ -1,8 +1,8 @@
-"""Which novel views to add, and how much each of their pixels counts: without the true pictures.
+"""Selection of novel views and the weights of their pixels, without ground truth.
 
-The denoiser says how wrong it expects each colour to be still. A pixel counts as much as a
-measurement of that error would beside a photo's: its confidence weight. A view's gain is how much
-it would change, where its weights are high.
+The denoiser estimates the remaining error of each pixel. The confidence weight of a pixel follows
+from that error, relative to the error of a photo. A view's gain is its mean change by denoising,
+weighted by confidence.
 """
 
 from __future__ import annotations
@@ -19,27 +19,26 @@ from igsr.refinement.novel_views import NovelView
 
 Float32 = npt.NDArray[np.float32]
 
-#: Error of a photo's colours as splats reproduce them: noise, and what the model cannot show. A
-#: pixel with this expected error has a confidence weight of one half.
+#: Error with which splats reproduce a photo's colors. A pixel with this expected error has a
+#: confidence weight of one half.
 PHOTO_ERROR = 0.06
-#: A view is selected only if its pixels' mean confidence weight is at least this.
-LEAST_CONFIDENCE = 0.15
-#: And if its gain is at least this: an eighth of an 8-bit level, with full confidence everywhere.
-LEAST_GAIN = 0.0005
+#: Minimum mean confidence weight of a selected view.
+MIN_CONFIDENCE = 0.15
+#: Minimum gain of a selected view: with full confidence, an eighth of an 8-bit level.
+MIN_GAIN = 0.0005
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A novel view, rendered and denoised, that may be added.
+    """A novel view, rendered and denoised.
 
     Attributes:
         view: its camera.
-        render: uint8 [H, W, 3], what the splats show.
-        denoised: uint8 [H, W, 3], the same after denoising.
-        confidence: float32 [H, W] in [0, 1], each pixel's weight beside a photo's pixel, which
-            has 1.
-        gain: mean over the pixels of confidence weight times absolute change by denoising, in
-            units of the colours' range.
+        render: uint8 [H, W, 3], render of the splats.
+        denoised: uint8 [H, W, 3], the render after denoising.
+        confidence: float32 [H, W] in [0, 1], weight of each pixel; photos have 1.
+        gain: mean over the pixels of confidence weight times absolute change by denoising; colors
+            are in [0, 1].
     """
 
     view: NovelView
@@ -56,7 +55,7 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class Rejected:
-    """A candidate that was not selected, without its pictures."""
+    """A candidate that was not selected, without its images."""
 
     view: NovelView
     mean_confidence: float
@@ -64,22 +63,21 @@ class Rejected:
 
 
 def rejected(candidate: Candidate) -> Rejected:
-    """A candidate without its pictures."""
+    """Remove the images of a candidate."""
     return Rejected(candidate.view, candidate.mean_confidence, candidate.gain)
 
 
 def denoised_candidate(
     view: NovelView, buffers: Buffers, photos: Sequence[Source], denoiser: Denoiser | None = None
 ) -> Candidate:
-    """Denoise a render, and find its confidence weights and gain.
+    """Denoise a render; compute its confidence weights and gain.
 
-    Where photos have masks, what no photo shows is no part of the scene that is wanted: a pixel's
-    weight is scaled by how much of what it shows photos see inside their masks.
+    If photos have masks, weights are scaled by the photos' support: masked surfaces are not wanted.
 
     Args:
-        view: where it was rendered from.
-        buffers: of ``igsr.denoiser.render_buffers``.
-        photos: of ``igsr.denoiser.photo_sources``.
+        view: the view of the render.
+        buffers: from ``igsr.denoiser.render_buffers``.
+        photos: from ``igsr.denoiser.photo_sources``.
         denoiser: None is the one that comes with igsr.
 
     Raises:
@@ -95,21 +93,21 @@ def denoised_candidate(
 
 
 def confidence_weights(certainty: Float32) -> Float32:
-    """Weights [H, W] of pixels beside a photo's, from the confidence map that a denoiser returns.
+    """Confidence weights [H, W] from a denoiser's confidence map.
 
-    Least squares weights measurements by their inverse variance. With the expected error e and the
-    photos' own error s, that is s^2 / (s^2 + e^2).
+    Least squares weights measurements by their inverse variance: s^2 / (s^2 + e^2) for the expected
+    error e and the photos' error s.
     """
     error = error_of(certainty)
     return (PHOTO_ERROR**2 / (PHOTO_ERROR**2 + error**2)).astype(np.float32)
 
 
 def select_views(candidates: Sequence[Candidate], count: int) -> list[Candidate]:
-    """At most ``count`` candidates of enough confidence and gain; the largest gain first."""
+    """Select up to ``count`` candidates with enough confidence and gain, largest gain first."""
     usable = [
         candidate
         for candidate in candidates
-        if candidate.mean_confidence >= LEAST_CONFIDENCE and candidate.gain >= LEAST_GAIN
+        if candidate.mean_confidence >= MIN_CONFIDENCE and candidate.gain >= MIN_GAIN
     ]
     return sorted(usable, key=lambda candidate: candidate.gain, reverse=True)[:count]
 

@@ -48,7 +48,7 @@ FORMATS = (".ply", ".compressed.ply", ".splat", ".spz", ".sog", ".glb", ".gltf")
 COMMAND = (sys.executable, "-m", "igsr.cli")
 
 WHITE = (1.0, 1.0, 1.0)
-GREY = (0.5, 0.5, 0.5)
+GRAY = (0.5, 0.5, 0.5)
 
 
 @dataclasses.dataclass
@@ -163,7 +163,7 @@ def fit(capture: igsr.Capture, *arguments: Any, **options: Any) -> tuple[igsr.Sp
 
 
 def opaque(view: igsr.View) -> igsr.View:
-    """A photo with alpha as one over grey without."""
+    """A photo with alpha as one over gray without."""
     alpha = view.image[..., 3:].astype(np.uint16)
     mixed = (view.image[..., :3] * alpha + 128 * (255 - alpha) + 127) // 255
     return replace(view, image=mixed.astype(np.uint8))
@@ -383,13 +383,13 @@ def formats(inputs: Inputs) -> Results:
 
 
 def renders(inputs: Inputs) -> Results:
-    """Colour, alpha, depth, normals and 8-bit pictures by each backend."""
+    """Color, alpha, depth, normals and 8-bit pictures by each backend."""
     scene = with_wall(inputs.ball, seed=2)
     antialiased = replace(scene, antialiased=True, origin=np.array([0.5, 0.0, -0.25]))
     for backend in ("reference", *inputs.fitting):
         for number, (right, up, width, height) in enumerate(((0, 0, 97, 61), (70, 20, 128, 128))):
             camera = camera_at(right, up, width, height)
-            found = igsr.render(scene, camera, GREY, backend=backend)
+            found = igsr.render(scene, camera, GRAY, backend=backend)
             yield f"{backend}.view {number}.color", [found.color, found.to_uint8()]
             yield f"{backend}.view {number}.alpha", [found.alpha, found.transmittance]
             yield f"{backend}.view {number}.depth", [found.depth, found.expected_depth]
@@ -475,7 +475,7 @@ def scores(inputs: Inputs) -> Results:
         found = igsr.evaluate(rough, inputs.around, backend=backend)
         yield from prefixed(f"{backend}.test", named_numbers(found))
     for name, capture in (("masks", inputs.bent), ("room", inputs.room)):
-        found = igsr.evaluate(rough, capture, "train", GREY, backend="cpu")
+        found = igsr.evaluate(rough, capture, "train", GRAY, backend="cpu")
         yield from prefixed(name, named_numbers(found))
 
 

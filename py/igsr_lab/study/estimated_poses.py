@@ -9,7 +9,7 @@ from pathlib import Path
 from igsr.cameras.registry import ESTIMATORS
 from igsr.capture import Camera, load_capture
 from igsr.capture.load import holds_cameras
-from igsr.capture.photo_folder import Photo, load_photos
+from igsr.capture.photo_folder import Photo, read_photos
 from igsr.errors import IgsrError
 from igsr.geometry.pose_errors import pose_accuracy
 from igsr_lab.report_parts import cell, markdown_table
@@ -116,7 +116,7 @@ def run_estimate(data: str, run: PoseRun) -> Row:
 
 def _photos(path: Path) -> tuple[list[Photo], list[Camera] | None]:
     if not holds_cameras(path):
-        return load_photos(path), None
+        return read_photos(path), None
     views = load_capture(path).views
     return [Photo(v.name, v.image, v.mask) for v in views], [v.camera for v in views]
 

@@ -17,7 +17,7 @@ from igsr.cameras.find import estimated_cameras, photos_at
 from igsr.cameras.load import check_enough_placed
 from igsr.capture import Camera, Capture, View, load_capture
 from igsr.capture.downscaling import resized_camera
-from igsr.capture.photo_folder import FRAMES, photo_sizes
+from igsr.capture.photo_folder import FRAMES, file_sizes
 from igsr.errors import IgsrError
 from igsr.evaluation.contact_sheet import save_sheet, sheet_names
 from igsr.evaluation.limits import limit_of
@@ -90,7 +90,7 @@ def find_scene_cameras(data: str, run: CameraRun) -> Row:
         row["warnings"] = [*given, *found.estimate.warnings]
         check_enough_placed(found, settings)
         usage = meter.lap()
-        write_cameras_file(Path(run.out), KeptCameras(found, photo_sizes(folder), usage))
+        write_cameras_file(Path(run.out), KeptCameras(found, file_sizes(folder), usage))
     except IgsrError as error:
         row["failed"] = str(error)
         usage = meter.lap()

@@ -12,7 +12,7 @@ from igsr._internal.part_usage import total
 from igsr._internal.worker_processes import in_a_process
 from igsr.capture.image_files import SUFFIXES
 from igsr.capture.load import holds_cameras
-from igsr.capture.photo_folder import photo_sizes
+from igsr.capture.photo_folder import file_sizes
 from igsr.errors import IgsrError
 from igsr.evaluation.quick_scores import MAX_TRAIN_PHOTOS
 from igsr.fitting.presets import default_max_size
@@ -203,7 +203,7 @@ def _camera_run(out: Path, scene: str, max_size: int) -> Run:
 
 
 def _fit_run(root: Path, fit: OwnFit, cameras: Row | None) -> Run:
-    placed = len(photo_sizes(root / fit.scene)) if cameras is None else cameras["placed"]
+    placed = len(file_sizes(root / fit.scene)) if cameras is None else cameras["placed"]
     photos = placed - len(range(0, placed, fit.holdout))
     settings: dict[str, Any] = {
         **preset_settings(fit.preset, photos, steps=fit.steps),
