@@ -273,7 +273,7 @@ class Fitter:
         state: dict[str, Any],
         config: dict[str, Any],
         backend: str,
-        holds: dict[str, Float64] | None = None,
+        pose_priors: dict[str, Float64] | None = None,
         exposures: dict[str, npt.NDArray[Any]] | None = None,
         rigs: Sequence[int] | None = None,
         depths: list[npt.NDArray[np.float32] | None] | None = None,
@@ -301,7 +301,7 @@ class Fitter:
                 exposures (whether gains and offsets of the photos are fitted). An absent or None
                 entry takes the default.
             backend: "cpu" or "gpu".
-            holds: pose priors of the cameras that are fitted: viewmats and intrinsics as above,
+            pose_priors: pose priors of the cameras that are fitted: viewmats and intrinsics as above,
                 information [V, 6, 6] (the inverse covariance of a rotation in radians about, and a
                 translation along, the camera's axes) and focal_information [V] (of the logarithm of
                 the focal length); zero where nothing is known.

@@ -35,7 +35,7 @@ pub fn state_from(
     Ok((state, elements("step", &step, &[1])?[0]))
 }
 
-/// Reads the state of the cameras, if the dict holds one.
+/// Reads the state of the cameras, if the dict pose_priors one.
 pub fn camera_state_from(dict: &Bound<'_, PyDict>, count: usize) -> PyResult<Option<CameraState>> {
     if !dict.contains("camera_viewmats")? {
         return Ok(None);
@@ -79,7 +79,7 @@ pub fn exposures_from(dict: &Bound<'_, PyDict>, count: usize) -> PyResult<Exposu
     Ok(((0..count).map(|k| fitted[k].then(|| start(k))).collect(), pulls))
 }
 
-/// Reads the state of the exposures, if the dict holds one.
+/// Reads the state of the exposures, if the dict pose_priors one.
 pub fn exposure_state_from(
     dict: &Bound<'_, PyDict>,
     count: usize,
@@ -119,7 +119,7 @@ pub fn set_exposure_state(dict: &Bound<'_, PyDict>, state: ExposureState) -> PyR
 /// Pose priors of the cameras: `viewmats` [V, 4, 4], `intrinsics` [V, 4], `information` [V, 6, 6] (the
 /// inverse covariance of rotation and translation), `focal_information` [V] (of the logarithm of the
 /// focal length).
-pub fn holds_from(dict: &Bound<'_, PyDict>, count: usize) -> PyResult<Vec<PosePrior>> {
+pub fn pose_priors_from(dict: &Bound<'_, PyDict>, count: usize) -> PyResult<Vec<PosePrior>> {
     let n = count as isize;
     let viewmats = entry::<f64>(dict, "viewmats")?;
     let viewmats = rows::<f64, 4>("viewmats", &viewmats, &[n, 4])?.as_chunks::<4>().0;
@@ -129,7 +129,7 @@ pub fn holds_from(dict: &Bound<'_, PyDict>, count: usize) -> PyResult<Vec<PosePr
     let information = rows::<f64, 6>("information", &information, &[n, 6])?.as_chunks::<6>().0;
     let focal_information = entry::<f64>(dict, "focal_information")?;
     let focal_information = elements("focal_information", &focal_information, &[n])?;
-    let hold = |i: usize| {
+    let prior = |i: usize| {
         let [fx, fy, ..] = intrinsics[i];
         PosePrior {
             viewmat: viewmat(&viewmats[i]),
@@ -138,7 +138,7 @@ pub fn holds_from(dict: &Bound<'_, PyDict>, count: usize) -> PyResult<Vec<PosePr
             log_focal: focal_information[i],
         }
     };
-    Ok((0..count).map(hold).collect())
+    Ok((0..count).map(prior).collect())
 }
 
 /// Writes the entries that [`camera_state_from`] reads.

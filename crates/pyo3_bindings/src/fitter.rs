@@ -13,7 +13,7 @@ use crate::camera::cameras;
 use crate::error::to_python;
 use crate::fit_settings::config_from;
 use crate::fit_state::{
-    camera_state_from, exposure_state_from, exposures_from, holds_from, set_camera_state,
+    camera_state_from, exposure_state_from, exposures_from, pose_priors_from, set_camera_state,
     set_cameras, set_exposure_state, state_from,
 };
 use crate::photos::targets_from;
@@ -30,7 +30,7 @@ const ARGUMENTS: [&str; 13] = [
     "state",
     "config",
     "backend",
-    "holds",
+    "pose_priors",
     "exposures",
     "rigs",
     "depths",
@@ -54,7 +54,7 @@ impl Fitter {
     #[new]
     #[pyo3(
         signature = (*positional, **named),
-        text_signature = "(images, masks, backgrounds, schedule, viewmats, intrinsics, state, config, backend, holds=None, exposures=None, rigs=None, depths=None)"
+        text_signature = "(images, masks, backgrounds, schedule, viewmats, intrinsics, state, config, backend, pose_priors=None, exposures=None, rigs=None, depths=None)"
     )]
     fn new<'py>(
         py: Python<'py>,
@@ -73,8 +73,8 @@ impl Fitter {
         let exposure_state = exposure_state_from(&state, cameras.len())?;
         let exposures = call.optional::<Bound<'_, PyDict>>("exposures")?;
         let exposures = exposures.map(|start| exposures_from(&start, cameras.len())).transpose()?;
-        let holds = call.optional::<Bound<'_, PyDict>>("holds")?;
-        let holds = holds.map(|holds| holds_from(&holds, cameras.len())).transpose()?;
+        let priors = call.optional::<Bound<'_, PyDict>>("pose_priors")?;
+        let priors = priors.map(|priors| pose_priors_from(&priors, cameras.len())).transpose()?;
         let rigs = call.optional::<Vec<u32>>("rigs")?;
         let (state, step) = state_from(&state, config.first_step, frozen)?;
         let device = fit_device(&call.take::<String>("backend")?)?;
@@ -85,8 +85,8 @@ impl Fitter {
             if let Some(rigs) = rigs {
                 fitter.set_rigs(&rigs)?;
             }
-            if let Some(holds) = holds {
-                fitter.set_pose_priors(holds)?;
+            if let Some(priors) = priors {
+                fitter.set_pose_priors(priors)?;
             }
             if let Some((exposures, pulls)) = exposures {
                 fitter.start_exposures(&exposures, &pulls)?;

@@ -249,7 +249,7 @@ impl Fitter {
     /// Sets the pose priors, one for each fitted camera, before the first step.
     pub fn set_pose_priors(&mut self, priors: Vec<PosePrior>) -> Result<()> {
         let Some(cameras) = self.moving.as_mut() else {
-            return Err(Error::argument("holds", "are of cameras that are not fitted"));
+            return Err(Error::argument("pose_priors", "are of cameras that are not fitted"));
         };
         cameras.set_pose_priors(priors)
     }

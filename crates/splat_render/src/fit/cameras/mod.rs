@@ -109,7 +109,7 @@ impl Cameras {
         if priors.len() != self.initial.len() {
             let count = self.initial.len();
             return Err(Error::argument(
-                "holds",
+                "pose_priors",
                 format!("must have one entry for {count} cameras"),
             ));
         }

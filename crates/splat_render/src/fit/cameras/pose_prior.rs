@@ -37,7 +37,7 @@ impl PosePrior {
             || !self.focal.iter().all(|&f| f > 0.0)
         {
             return Err(Error::argument(
-                format!("holds[{k}]"),
+                format!("pose_priors[{k}]"),
                 "must be finite, with positive focal lengths and information that is not negative",
             ));
         }
