@@ -301,7 +301,7 @@ class Fitter:
                 exposures (whether gains and offsets of the photos are fitted). An absent or None
                 entry takes the default.
             backend: "cpu" or "gpu".
-            pose_priors: pose priors of the cameras that are fitted: viewmats and intrinsics as above,
+            pose_priors: pose priors of the fitted cameras: viewmats and intrinsics as above,
                 information [V, 6, 6] (the inverse covariance of a rotation in radians about, and a
                 translation along, the camera's axes) and focal_information [V] (of the logarithm of
                 the focal length); zero where nothing is known.

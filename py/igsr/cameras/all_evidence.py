@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from igsr._internal.name_lists import listed
 from igsr.cameras.colmap.adjustment import (
     MIN_POINTS,
     Adjusted,
@@ -31,7 +32,6 @@ from igsr.cameras.colmap.predicted_matches import matched_by_prediction, without
 from igsr.cameras.colmap.result import estimate_of
 from igsr.cameras.depth_maps import AlignedPhoto
 from igsr.cameras.estimate import Progress
-from igsr.cameras.name_lists import listed
 from igsr.cameras.prior_adjustment import Spread, spread_of
 from igsr.capture import Camera, Points
 from igsr.capture.photo_folder import Photo

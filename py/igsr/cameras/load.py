@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from igsr._internal.event import CAMERAS_FOUND
+from igsr._internal.name_lists import listed
 from igsr._internal.part_usage import Meter
 from igsr._internal.user_warning import warn_user
 from igsr.cameras.cameras_file import KeptCameras, read_cameras_file, write_cameras_file
@@ -26,8 +27,6 @@ from igsr.run import Run
 CAMERAS_FILE = "cameras.npz"
 #: A run ends if fewer than this fraction of the photos are placed, unless it is allowed.
 MIN_PLACED_FRACTION = 0.5
-#: Maximum number of photo names in a message.
-MAX_NAMES = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,15 +131,11 @@ def check_enough_placed(found: FoundCameras, settings: CameraSettings) -> None:
     placed, count = len(found.placed), len(found.names)
     if settings.allow_missing or placed >= MIN_PLACED_FRACTION * count:
         return
-    lost = found.not_placed
-    names = ", ".join(lost[:MAX_NAMES])
-    if len(lost) > MAX_NAMES:
-        names += f" and {len(lost) - MAX_NAMES} more"
     networks = [name for name in NETWORKS if ESTIMATORS[name].ready({})]
     others = [name for name in networks if name != settings.estimator]
     advice = f", try estimator {' or '.join(others)}" if others else ""
     raise IgsrError(
-        f"Only {placed} of {count} photos could be placed, not {names}: "
+        f"Only {placed} of {count} photos could be placed, not {listed(found.not_placed)}: "
         f"add photos between them that overlap more, leave out photos of another scene{advice}, or "
         "continue with those that are placed (--allow-missing, allow_missing=True)."
     )

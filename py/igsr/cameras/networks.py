@@ -14,7 +14,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from igsr.cameras.name_lists import listed
+from igsr._internal.name_lists import listed
 from igsr.errors import IgsrError
 
 #: Hidden channels of a block's MLP per channel of the block.

@@ -48,19 +48,13 @@ def _colmap(matcher: Matcher | None = None) -> Estimator:
 
 def _da3(
     checkpoint: str | os.PathLike[str] | None = None,
-    cameras: Mapping[str, Camera] | None = None,
     bundle_adjustment: bool = True,
     matcher: Matcher | None = None,
 ) -> Estimator:
     with naming_extra("estimator da3"):
         from igsr.cameras.da3.estimator import Da3
 
-    return Da3(
-        checkpoint=checkpoint,
-        cameras=cameras,
-        bundle_adjustment=bundle_adjustment,
-        matcher=matcher,
-    )
+    return Da3(checkpoint=checkpoint, bundle_adjustment=bundle_adjustment, matcher=matcher)
 
 
 def _is_ready(estimator: str) -> Callable[[Mapping[str, Any]], bool]:

@@ -13,9 +13,10 @@ from pathlib import PurePosixPath
 import numpy as np
 import numpy.typing as npt
 
+from igsr._internal.name_lists import listed
 from igsr._internal.user_warning import warn_user
 from igsr.capture.downscaling import plane_area_means, reduced_size
-from igsr.capture.photo_folder import Photo, listed
+from igsr.capture.photo_folder import Photo
 from igsr.capture.sharpness import blur, blurred_photos
 from igsr.capture.types import PseudoView, View
 from igsr.capture.video_frames import VIDEO_SUFFIXES

@@ -24,6 +24,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from igsr._internal.name_lists import listed
 from igsr._internal.user_warning import warn_user
 from igsr.capture.downscaling import area_means, check_max_size, reduced_size
 from igsr.capture.exif import TURNED, Exif, read_exif, turned_back, upright
@@ -44,8 +45,6 @@ FRAMES = 100
 MIN_PHOTOS = 2
 #: File in a folder of photos that describes their lens; see the module.
 LENS = "lens.json"
-#: Maximum number of names in a message.
-_MAX_NAMES = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,12 +154,6 @@ def read_photos(path: Paths, frames: int = FRAMES, max_size: int | None = None) 
     return photos
 
 
-def listed(names: Sequence[str]) -> str:
-    """Return the first names, and the number of others, for a message."""
-    others = len(names) - _MAX_NAMES
-    return ", ".join(names[:_MAX_NAMES]) + (f" and {others} more" if others > 0 else "")
-
-
 def has_photos(path: Path) -> bool:
     """Return whether a path is a video, or a folder that holds photos or videos."""
     if is_file(path):
@@ -214,6 +207,8 @@ def _find_files(path: Paths) -> tuple[Path, list[Path], Path]:
             raise IgsrError(f"{folder} does not exist or is no folder; give a folder of photos")
         root = _photo_root(folder)
         files = sorted(_walk(root), key=lambda file: file.relative_to(root).as_posix())
+    except IgsrError:  # a ValueError, too
+        raise
     except (OSError, ValueError) as error:
         raise IgsrError(f"{folder} cannot be read; give a folder of photos") from error
     if not files:

@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from igsr.denoiser.architecture import MULTIPLE, Architecture
-from igsr.denoiser.inputs import BUFFERS, CHANNELS, CHOICES, COLOR, PHOTO, PHOTOS
+from igsr.denoiser.inputs import BUFFERS, CHANNELS, CHOICES, COLOR, PHOTO
 
 #: Receptive field in each direction, pixels; a multiple of ``MULTIPLE``.
 REACH_PX = 96
@@ -63,24 +63,6 @@ class _Block(nn.Module):
         return x.permute(0, 3, 1, 2)
 
 
-class _PhotoAttention(nn.Module):
-    """Attention over the photos of each pixel."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.query = nn.Conv2d(4 * (COLOR + BUFFERS), width, 1)
-        self.key = nn.Conv2d(4 * PHOTO, width, 1)
-        self.value = nn.Conv2d(4 * PHOTO, width, 1)
-
-    def forward(self, render: Tensor, photos: Tensor) -> Tensor:
-        batch, _, height, width = photos.shape
-        each = photos.reshape(batch * CHOICES, -1, height, width)
-        key = self.key(each).reshape(batch, CHOICES, -1, height, width)
-        value = self.value(each).reshape(batch, CHOICES, -1, height, width)
-        fit = (self.query(render)[:, None] * key).sum(dim=2) / key.shape[2] ** 0.5
-        return (fit.softmax(dim=1)[:, :, None] * value).sum(dim=1)
-
-
 class DenoiserNetwork(nn.Module):
     """Predict a picture and the logarithm of its expected error from ``network_inputs``.
 
@@ -93,10 +75,7 @@ class DenoiserNetwork(nn.Module):
         super().__init__()
         self.architecture = architecture or Architecture()
         width, (half, quarter, eighth) = self.architecture.width, self.architecture.blocks
-        attention = self.architecture.photos == "attention"
-        self.attention = _PhotoAttention(width) if attention else None
-        channels = 4 * (COLOR + BUFFERS) + (width if attention else 4 * CHOICES * PHOTO)
-        self.head = nn.Conv2d(channels, width, 3, padding=1)
+        self.head = nn.Conv2d(4 * CHANNELS, width, 3, padding=1)
         self.down_half = nn.Sequential(*(_Block(width) for _ in range(half)))
         self.to_quarter = nn.Conv2d(width, 2 * width, 2, stride=2)
         self.down_quarter = nn.Sequential(*(_Block(2 * width) for _ in range(quarter)))
@@ -127,25 +106,13 @@ class DenoiserNetwork(nn.Module):
         height, width = inputs.shape[-2:]
         padding = (0, -width % MULTIPLE, 0, -height % MULTIPLE)
         x = F.pad(inputs, padding, mode="replicate")
-        render, photos = x[:, : COLOR + BUFFERS], x[:, COLOR + BUFFERS :]
-        if not self.architecture.buffers:
-            render = torch.cat([render[:, :COLOR], torch.zeros_like(render[:, COLOR:])], dim=1)
-        if self.architecture.photos == "none":
-            behind = photos[:, PHOTOS * PHOTO :]
-            photos = torch.cat([torch.zeros_like(photos[:, : PHOTOS * PHOTO]), behind], dim=1)
-        mixed = torch.cat([render, photos], dim=1)[..., :height, :width]
-        render, photos = F.pixel_unshuffle(render, 2), F.pixel_unshuffle(photos, 2)
-        if self.attention is not None:
-            photos = self.attention(render, photos)
-        half = self.down_half(self.head(torch.cat([render, photos], dim=1)))
+        half = self.down_half(self.head(F.pixel_unshuffle(x, 2)))
         quarter = self.down_quarter(self.to_quarter(half))
         eighth = self.dropout(self.middle(self.to_eighth(quarter)))
         quarter = self.up_quarter(quarter + F.pixel_shuffle(self.from_eighth(eighth), 2))
         half = self.up_half(half + F.pixel_shuffle(self.from_quarter(quarter), 2))
         out = F.pixel_shuffle(self.tail(half), 2)[..., :height, :width]
-        image = out[:, :COLOR]
-        if self.architecture.residual:
-            image = image + _mixed(mixed, out[:, COLOR + 1 :] + INITIAL_LOGIT)
+        image = out[:, :COLOR] + _mixed(inputs, out[:, COLOR + 1 :] + INITIAL_LOGIT)
         log_error = out[:, COLOR : COLOR + 1] + INITIAL_LOG_ERROR
         return image, log_error.clamp(MIN_LOG_ERROR, MAX_LOG_ERROR)
 

@@ -17,6 +17,8 @@ from igsr.denoiser.architecture import Architecture
 from igsr.denoiser.network import DenoiserNetwork
 from igsr.errors import IgsrError
 
+#: Settings of earlier architectures; only these values are supported.
+_FORMER_SETTINGS = {"residual": True, "buffers": True, "photos": "concatenated"}
 #: The denoiser that comes with igsr.
 SHIPPED = Path(__file__).with_name("denoiser.safetensors")
 
@@ -91,7 +93,9 @@ def load_network(path: str | os.PathLike[str] | None = None) -> DenoiserNetwork:
 def _architecture(text: str | None, path: Path) -> Architecture:
     try:
         settings = json.loads(text or "")
-        return Architecture(**{**settings, "blocks": tuple(settings["blocks"])})
+        if any(settings.get(name, value) != value for name, value in _FORMER_SETTINGS.items()):
+            raise IgsrError("igsr no longer has its settings; train it again")
+        return Architecture(settings["width"], tuple(settings["blocks"]))
     except IgsrError as error:
         raise IgsrError(f"{path} has an unsupported architecture: {error}") from error
     except (ValueError, TypeError, KeyError, RecursionError) as error:

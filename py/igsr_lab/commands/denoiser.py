@@ -156,15 +156,6 @@ def train_command(
     width: Annotated[
         int, option("--width", help="Channels at half resolution.")
     ] = Architecture.width,
-    residual: Annotated[
-        bool, option("--residual/--no-residual", help="Add the output to the render.")
-    ] = Architecture.residual,
-    buffers: Annotated[
-        bool, option("--buffers/--no-buffers", help="Use alpha, depth, normals ... as input.")
-    ] = Architecture.buffers,
-    photos: Annotated[
-        str, option("--photos", help="concatenated, attention or none.")
-    ] = Architecture.photos,
     device: Annotated[str, option("--device", help="torch device: cpu, cuda ...")] = "cpu",
     resume: Annotated[
         bool, option("--resume", help="Continue from the checkpoint in --out.")
@@ -198,7 +189,7 @@ def train_command(
                 files,
                 out,
                 Training(**given),
-                Architecture(width=width, residual=residual, buffers=buffers, photos=photos),
+                Architecture(width),
                 distance=distance,
                 start=start,
                 device=device,

@@ -44,7 +44,6 @@ class NetworkConfig:
     heads: int  # attention heads of the backbone
     features: int  # channels in which the head fuses its levels
     out_channels: tuple[int, int, int, int]  # channels of the head's levels, the finest first
-    camera_heads: int = 16  # attention heads of the camera encoder
 
 
 SMALL = NetworkConfig(embed_dim=384, heads=6, features=64, out_channels=(48, 96, 192, 384))
@@ -143,7 +142,6 @@ class Transformer(nn.Module):
         self,
         views: Sequence[Tensor],
         reference: int | None = None,
-        camera_tokens: Tensor | None = None,
     ) -> list[ViewFeatures]:
         """Compute features per view.
 
@@ -151,7 +149,6 @@ class Transformer(nn.Module):
             views: float32 [3, H, W] each, normalized; H and W are multiples of 14.
             reference: index of the reference view, whose camera frame the world is close to; by
                 default it is chosen.
-            camera_tokens: [S, C] of known cameras; the first view is the reference then.
         """
         grids = [(view.shape[-2] // PATCH, view.shape[-1] // PATCH) for view in views]
         embeddings = {grid: self.positions(*grid) for grid in set(grids)}
@@ -161,7 +158,7 @@ class Transformer(nn.Module):
         # The view of each entry of ``tokens``: the reference comes first.
         order = list(range(len(views)))
         for n in range(FIRST_GLOBAL):
-            if n == CHOICE_BLOCK and camera_tokens is None and len(views) >= MIN_VIEWS_TO_CHOOSE:
+            if n == CHOICE_BLOCK and len(views) >= MIN_VIEWS_TO_CHOOSE:
                 if reference is None:
                     reference = reference_view(torch.stack([one[0] for one in tokens]))
                 order.insert(0, order.pop(reference))
@@ -169,7 +166,7 @@ class Transformer(nn.Module):
             for at, one in enumerate(tokens):
                 tokens[at] = self.blocks[n]([one])[0]
         for at, one in enumerate(tokens):
-            token = self.camera_token[0, min(at, 1)] if camera_tokens is None else camera_tokens[at]
+            token = self.camera_token[0, min(at, 1)]
             tokens[at] = torch.cat([token.to(one.dtype)[None], one[1:]])
         rotations = {grid: self.rotations(*grid) for grid in set(grids)}
         local_turns, global_turns = zip(*(rotations[grids[view]] for view in order), strict=True)

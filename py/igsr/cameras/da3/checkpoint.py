@@ -17,7 +17,6 @@ from torch import Tensor
 
 from igsr.cameras.checkpoint_search import WEIGHTS, exists
 from igsr.cameras.da3.backbone import BASE, FIRST_GLOBAL, OUTPUT_BLOCKS, SMALL, NetworkConfig
-from igsr.cameras.da3.head import RAY_LEVEL, SHARED_NORM
 from igsr.cameras.da3.network import Da3Network
 from igsr.cameras.networks import (
     Checkpoint,
@@ -37,8 +36,8 @@ SIZES = {"da3-small": SMALL, "da3-base": BASE}
 _PREFIX = "model."
 #: The same sizes, by the names of the backbone in a config.json.
 _NET_NAMES = {"vits": "da3-small", "vitb": "da3-base"}
-#: Outputs of the ray chain at other levels, which are for training.
-_UNUSED = re.compile(r"head\.scratch\.output_conv[12]_aux\.[012]\..*")
+#: Parts that are not implemented: rays, and the encoder of known cameras.
+_UNUSED = re.compile(r"head\.scratch\.\w+_aux\..*|cam_enc\..*")
 #: Keys of the larger models.
 _LARGER = re.compile(
     r"(da3|da3_metric|gs_head|gs_adapter)\..*|backbone\.pretrained\.blocks\.1[2-9]\..*"
@@ -97,33 +96,15 @@ def read_weights(
     """Read the weights of a network from an open file, and list the keys that it does not have."""
     weights, used = {}, set()
     for key, tensor in without_weights(Da3Network, config).state_dict().items():
-        stored = _stored_keys(key, shapes)
-        values = [_weight(path, file, shapes, one, tuple(tensor.shape)) for one in stored]
-        if any(not torch.equal(values[0], value) for value in values[1:]):
-            raise IgsrError(
-                f"{path}: {stored[0]} and {stored[1]} differ, but the network shares this norm; "
-                "the file is damaged or of another network"
-            )
-        weights[key] = values[0]
-        used.update(stored)
+        stored = _PREFIX + key
+        weights[key] = _weight(path, file, shapes, stored, tuple(tensor.shape))
+        used.add(stored)
     unknown = [
         key
         for key in shapes
         if key not in used and not _UNUSED.fullmatch(key.removeprefix(_PREFIX))
     ]
     return weights, sorted(unknown)
-
-
-def _stored_keys(key: str, shapes: Mapping[str, tuple[int, ...]]) -> list[str]:
-    """The keys of the file for a weight; the shared norm may have one or two.
-
-    safetensors stores a tensor with several names once, under the first of them.
-    """
-    used, first = (f"head.{SHARED_NORM.format(level)}." for level in (RAY_LEVEL, 0))
-    if not key.startswith(used):
-        return [_PREFIX + key]
-    both = [_PREFIX + key, _PREFIX + key.replace(used, first)]
-    return [one for one in both if one in shapes] or both[1:]
 
 
 def _weight(
@@ -192,8 +173,6 @@ def size_of(content: Mapping[str, Any], source: str) -> str:
     size = _NET_NAMES[str(net)]
     check("net.name", net, named in (None, size), f"the one for {named}")
     for name, (class_name, numbers) in _described(SIZES[size]).items():
-        if name == "cam_enc" and name not in parts:
-            continue  # only needed for known cameras
         described = part(name)
         declared = described.get("__object__", {})
         declared = declared.get("name") if isinstance(declared, Mapping) else declared
@@ -227,6 +206,5 @@ def _described(config: NetworkConfig) -> dict[str, tuple[str, dict[str, Any]]]:
                 "out_channels": list(config.out_channels),
             },
         ),
-        "cam_enc": ("CameraEnc", {"dim_out": dim}),
         "cam_dec": ("CameraDec", {"dim_in": 2 * dim}),
     }

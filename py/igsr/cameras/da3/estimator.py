@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from igsr._internal.name_lists import listed
 from igsr.cameras.all_evidence import Evidence, with_all_evidence
 from igsr.cameras.checkpoint_search import find_checkpoint
 from igsr.cameras.colmap.matcher import Matcher, checked_matcher
@@ -23,18 +24,12 @@ from igsr.cameras.depth_maps import (
     trusted_depths,
 )
 from igsr.cameras.estimate import Estimate
-from igsr.cameras.given_cameras import check_given_cameras
-from igsr.cameras.name_lists import listed
 from igsr.cameras.weights import sha256_of
-from igsr.capture import Camera
 from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
-from igsr.geometry.similarity import similarity_between
 
 #: Name in messages.
 NETWORK = "Depth Anything 3"
-#: Maximum distance of a principal point from the center without a warning, in units of the side.
-MAX_OFF_CENTER = 0.05
 #: Maximum distance between cameras that stand at one place, in units of the median depth.
 MAX_ONE_PLACE = 1e-3
 
@@ -46,7 +41,6 @@ class Da3:
         predictor: predicts cameras and depths; by default the network.
         checkpoint: safetensors file with the network's weights, or its folder; by default it is
             searched for.
-        cameras: known cameras of all photos by name, which are kept: only depths are estimated.
         bundle_adjustment: whether to adjust cameras to features (``igsr.cameras.all_evidence``).
         matcher: of these features, as for ``Colmap``.
     """
@@ -57,13 +51,11 @@ class Da3:
         self,
         predictor: Predictor | None = None,
         checkpoint: str | os.PathLike[str] | None = None,
-        cameras: Mapping[str, Camera] | None = None,
         bundle_adjustment: bool = True,
         matcher: Matcher | None = None,
     ) -> None:
         self.predictor = predictor
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
-        self.cameras = dict(cameras or {})
         self.bundle_adjustment = bundle_adjustment
         self.matcher = checked_matcher(matcher)
 
@@ -74,7 +66,7 @@ class Da3:
         seed: int = 0,
         progress: Callable[[str, int, int], None] | None = None,
     ) -> Estimate:
-        """Find the cameras of photos, or depths for known cameras.
+        """Find the cameras of photos.
 
         Photos of one device, size and EXIF focal length, upright or not, share their focal length;
         principal points are in the center.
@@ -85,66 +77,32 @@ class Da3:
             progress: called as progress("passes", done, total), then with COLMAP's stages.
 
         Raises:
-            IgsrError: cameras are known of only some photos, of other photos or for another size,
-                no checkpoint is found, a photo is too narrow, or two photos do not fit into memory.
+            IgsrError: no checkpoint is found, a photo is too narrow, or two photos do not fit into
+                memory.
         """
-        check_given_cameras(self.cameras, photos)
-        missing = [photo.name for photo in photos if photo.name not in self.cameras]
-        if self.cameras and missing:
-            raise IgsrError(
-                f"cameras has none for {listed(missing)}; Depth Anything 3 takes the cameras of "
-                "all photos or of none"
-            )
         predictor, weights = (self.predictor, None) if self.predictor else self._network()
         plan = passes_of(len(photos), predictor.most_photos(photos))
         total, done = sum(len(part) for part in plan), 0
         passes = []
         for part in plan:
-            passes.append(self._predicted(predictor, part, photos, seed))
+            predicted = predictor([photos[i] for i in part], seed)
+            placed = zip(part, predicted, strict=True)
+            passes.append({i: one for i, one in placed if one is not None})
             done += len(part)
             if progress is not None:
                 progress("passes", done, total)
-        lost: list[int] = []
-        if self.cameras:
-            world = {i: one for each in reversed(passes) for i, one in each.items()}
-        else:
-            world, lost = joined_passes(passes)
-        aligned = [world.get(i) for i in range(len(photos))]
+        world, lost = joined_passes(passes)
+        aligned = with_shared_focals(photos, [world.get(i) for i in range(len(photos))])
         evidence = None
-        if not self.cameras:
-            aligned = with_shared_focals(photos, aligned)
-            if self.bundle_adjustment:
-                confident = [None if one is None else confident_pixels(one) for one in aligned]
-                evidence = with_all_evidence(
-                    photos, aligned, confident, NETWORK, self.matcher, seed, progress
-                )
+        if self.bundle_adjustment:
+            confident = [None if one is None else confident_pixels(one) for one in aligned]
+            evidence = with_all_evidence(
+                photos, aligned, confident, NETWORK, self.matcher, seed, progress
+            )
         estimate = self._estimate(photos, aligned, evidence)
         estimate.warnings = self._warnings(photos, aligned, lost, evidence)
         estimate.weights = weights
         return estimate
-
-    def _predicted(
-        self, predictor: Predictor, part: Sequence[int], photos: Sequence[Photo], seed: int
-    ) -> dict[int, AlignedPhoto]:
-        """Predict a pass; with known cameras, in their world."""
-        shown = [photos[i] for i in part]
-        known = [self.cameras[photo.name] for photo in shown] if self.cameras else None
-        centers = np.array([camera.center for camera in known or ()])
-        # Tolerate only rounding: coordinates may be millions of meters, as in map projections.
-        if len(centers) and np.ptp(centers, axis=0).max() <= 1e-9 * np.abs(centers).max():
-            raise IgsrError(
-                "the known cameras of a pass all stand at one place, which sets no scale; leave "
-                "cameras out"
-            )
-        predicted = predictor(shown, known, seed)
-        placed = {i: one for i, one in zip(part, predicted, strict=True) if one is not None}
-        if not known or not placed:
-            return placed
-        cameras = {i: self.cameras[photos[i].name] for i in placed}
-        similarity = similarity_between(
-            [placed[i].camera for i in placed], [cameras[i] for i in placed]
-        )
-        return {i: replace(placed[i].mapped(similarity), camera=cameras[i]) for i in placed}
 
     def _estimate(
         self,
@@ -159,8 +117,6 @@ class Da3:
         for photo, placed, mask in zip(photos, aligned, trusted, strict=True):
             if placed is not None and mask is not None:
                 mask &= placed.grid.usable(photo)
-        if self.cameras:
-            cameras = [self.cameras[photo.name] for photo in photos]
         return Estimate(
             cameras=cameras,
             points=joined_points(
@@ -210,17 +166,6 @@ class Da3:
                     "All photos seem to be taken from one place, which does not show distances; "
                     "take photos from different places"
                 )
-        off_center = [
-            name
-            for name, camera in self.cameras.items()
-            if abs(camera.K[0, 2] / camera.width - 0.5) > MAX_OFF_CENTER
-            or abs(camera.K[1, 2] / camera.height - 0.5) > MAX_OFF_CENTER
-        ]
-        if off_center:
-            warnings.append(
-                f"The principal point of {listed(off_center)} is far from the center, where Depth "
-                "Anything 3 assumes it, so depths may be wrong; give whole photos, not crops"
-            )
         return warnings
 
     def _network(self) -> tuple[Predictor, dict[str, str]]:

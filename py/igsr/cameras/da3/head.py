@@ -1,8 +1,8 @@
-"""The head of Depth Anything 3: depth, confidence and rays of one view's pixels from its features.
+"""The head of Depth Anything 3: depth and confidence of one view's pixels from its features.
 
-A dense prediction transformer (Ranftl et al. 2021) with two chains over the same levels, for depth
-and for rays (arXiv 2511.10647, section 3). Module names are as in the checkpoints. The
-head always runs in float32, and for one view at a time.
+A dense prediction transformer (Ranftl et al. 2021; arXiv 2511.10647, section 3), without the
+published chain for rays. Module names are as in the checkpoints. The head always runs in float32,
+and for one view at a time.
 """
 
 from __future__ import annotations
@@ -17,18 +17,12 @@ from igsr.cameras.networks import ResidualConvs
 #: Base of the frequencies of position embeddings, and their amplitude.
 POSITION_BASE = 100.0
 POSITION_AMPLITUDE = 0.1
-#: Channels before the last convolution of each chain.
+#: Channels before the last convolution.
 LAST_CHANNELS = 32
-#: Direction, origin and confidence of a ray.
-RAY_CHANNELS = 7
-#: The level of the ray chain whose outputs are used; others are for training.
-RAY_LEVEL = 3
-#: The published networks share one norm between the outputs of all levels.
-SHARED_NORM = "scratch.output_conv2_aux.{}.2"
 
 
-class DualHead(nn.Module):
-    """Predict depth and rays of a view."""
+class DepthHead(nn.Module):
+    """Predict the depth of a view."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
@@ -48,52 +42,25 @@ class DualHead(nn.Module):
         self.scratch = nn.ModuleDict()
         for level, channels in enumerate(config.out_channels, start=1):
             self.scratch[f"layer{level}_rn"] = _conv3(channels, features, bias=False)
-            for chain in ("", "_aux"):
-                self.scratch[f"refinenet{level}{chain}"] = _Fusion(features, level == 4)
+            self.scratch[f"refinenet{level}"] = _Fusion(features, level == 4)
         half = features // 2
         self.scratch["output_conv1"] = _conv3(features, half)
         self.scratch["output_conv2"] = nn.Sequential(
             _conv3(half, LAST_CHANNELS), nn.ReLU(), nn.Conv2d(LAST_CHANNELS, 2, 1)
         )
-        # There is no activation between these five.
-        ray_convs = nn.Sequential(
-            *(_conv3(*((features, half) if n % 2 == 0 else (half, features))) for n in range(5))
-        )
-        ray_outputs = nn.Sequential(
-            _conv3(half, LAST_CHANNELS),
-            nn.Identity(),
-            nn.LayerNorm(LAST_CHANNELS),
-            nn.Identity(),
-            nn.ReLU(),
-            nn.Conv2d(LAST_CHANNELS, RAY_CHANNELS, 1),
-        )
-        self.scratch["output_conv1_aux"] = nn.ModuleDict({str(RAY_LEVEL): ray_convs})
-        self.scratch["output_conv2_aux"] = nn.ModuleDict({str(RAY_LEVEL): ray_outputs})
 
-    def forward(
-        self, features: ViewFeatures, rays: bool
-    ) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
-        """Predict a view's depth, confidence, rays and ray confidence; see ``ViewPrediction``."""
+    def forward(self, features: ViewFeatures) -> tuple[Tensor, Tensor]:
+        """Predict a view's depth and confidence; see ``ViewPrediction``."""
         levels = self._levels(features)
         height, width = PATCH * features.rows, PATCH * features.columns
         aspect = width / height
-        maps = self.scratch["output_conv1"](self._fused(levels, ""))
+        maps = self.scratch["output_conv1"](self._fused(levels))
         maps = _with_positions(_resized(maps, (height, width)), aspect)
         channels = self.scratch["output_conv2"](maps)[0]
-        depth, confidence = channels[0].exp(), 1.0 + channels[1].exp()
-        if not rays:
-            return depth, confidence, None, None
-        convs, outputs = (
-            self.scratch.get_submodule(f"output_conv{n}_aux.{RAY_LEVEL}") for n in (1, 2)
-        )
-        maps = convs(self._fused(levels, "_aux"))
-        first, _, norm, _, relu, last = outputs.children()
-        maps = first(_with_positions(maps, aspect))
-        channels = last(relu(norm(maps.movedim(1, -1)).movedim(-1, 1)))[0]
-        return depth, confidence, channels[:6].movedim(0, -1), 1.0 + channels[6].exp()
+        return channels[0].exp(), 1.0 + channels[1].exp()
 
     def _levels(self, features: ViewFeatures) -> list[Tensor]:
-        """The four levels [1, F, h, w] that both chains fuse, the finest first."""
+        """The four levels [1, F, h, w], the finest first."""
         aspect = features.columns / features.rows
         levels = []
         for n, level in enumerate(features.levels):
@@ -103,13 +70,13 @@ class DualHead(nn.Module):
             levels.append(self.scratch[f"layer{n + 1}_rn"](self.resize_layers[n](image)))
         return levels
 
-    def _fused(self, levels: list[Tensor], chain: str) -> Tensor:
-        """Fuse levels to [1, F, 8 gh, 8 gw], for depth ("") or for rays ("_aux")."""
+    def _fused(self, levels: list[Tensor]) -> Tensor:
+        """Fuse levels to [1, F, 8 gh, 8 gw]."""
         fused = None
         for n in (3, 2, 1, 0):
             height, width = levels[n].shape[-2:]
             size = levels[n - 1].shape[-2:] if n else (2 * height, 2 * width)
-            fused = self.scratch[f"refinenet{n + 1}{chain}"](levels[n], fused, tuple(size))
+            fused = self.scratch[f"refinenet{n + 1}"](levels[n], fused, tuple(size))
         assert fused is not None
         return fused
 

@@ -70,12 +70,6 @@ class Resampling:
         scale_x, scale_y = self.photo_width / self.width, self.photo_height / self.height
         return Grid(self.height, self.width, scale_x, scale_y, 0.0, 0.0)
 
-    def intrinsics(self, K: Float64) -> Float64:
-        """Convert intrinsics [3, 3] from the photo's pixels to the network's."""
-        scale_x, scale_y = self.width / self.photo_width, self.height / self.photo_height
-        scaled: Float64 = np.diag([scale_x, scale_y, 1.0]) @ K
-        return scaled
-
 
 def resampling_of(width: int, height: int, resolution: int = RESOLUTION) -> Resampling:
     """Choose the resampling of a photo.
@@ -181,14 +175,11 @@ class Predictor(Protocol):
         """Maximum number of photos in one pass."""
         ...
 
-    def __call__(
-        self, photos: Sequence[Photo], cameras: Sequence[Camera] | None, seed: int
-    ) -> list[AlignedPhoto | None]:
+    def __call__(self, photos: Sequence[Photo], seed: int) -> list[AlignedPhoto | None]:
         """Predict cameras and depths of photos in one world of an arbitrary unit.
 
         Args:
             photos: at least two.
-            cameras: of all photos, if known, in any world; the prediction is near them.
             seed: random seed.
 
         Returns:
@@ -228,21 +219,14 @@ class Da3Predictor:
                 )
         return most
 
-    def __call__(
-        self, photos: Sequence[Photo], cameras: Sequence[Camera] | None, seed: int
-    ) -> list[AlignedPhoto | None]:
+    def __call__(self, photos: Sequence[Photo], seed: int) -> list[AlignedPhoto | None]:
         resamplings = resamplings_of(photos)
         inputs = [
             torch.from_numpy(network_input(on_white(photo.image), one)).to(self.device)
             for photo, one in zip(photos, resamplings, strict=True)
         ]
-        viewmats = intrinsics = None
-        if cameras is not None:
-            pairs = zip(resamplings, cameras, strict=True)
-            viewmats = torch.from_numpy(np.stack([camera.viewmat for camera in cameras]))
-            intrinsics = torch.from_numpy(np.stack([one.intrinsics(c.K) for one, c in pairs]))
         with torch.inference_mode(), half_precision(self.device):
-            views = self.network.predict(inputs, viewmats, intrinsics, rays=False)
+            views = self.network.predict(inputs)
         return [
             self._aligned(photo, one, view)
             for photo, one, view in zip(photos, resamplings, views, strict=True)
