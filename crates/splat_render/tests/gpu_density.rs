@@ -13,10 +13,6 @@ use splat_render::cpu::CpuFit;
 use splat_render::fit::{FitDevice, FitState, McmcRun, OriginalRun};
 use splat_render::gpu::{Gpu, GpuFit};
 
-fn gpu() -> Gpu {
-    Gpu::new(true).unwrap_or_else(|e| panic!("{e}"))
-}
-
 /// A state in the middle of a fit, with dead, foggy and invalid splats.
 fn amid_a_fit(seed: u64, splats: usize, sh_degree: u32) -> FitState {
     let mut rng = rng(seed);

@@ -23,14 +23,14 @@ fn message(result: splat_render::Result<()>) -> String {
 
 #[test]
 fn a_sound_device_passes() {
-    let gpu = Gpu::new(true).unwrap_or_else(|e| panic!("{e}"));
+    let gpu = gpu();
     let began = std::time::Instant::now();
     gpu.compile_all().unwrap_or_else(|e| panic!("{e}"));
     println!("kernels compiled in {:?}", began.elapsed());
     let began = std::time::Instant::now();
     self_test(&Arc::new(gpu)).unwrap_or_else(|e| panic!("{e}"));
     println!("self-test in {:?}", began.elapsed());
-    let plain = Gpu::new(true).unwrap().without_subgroups();
+    let plain = gpu().without_subgroups();
     self_test(&Arc::new(plain)).unwrap_or_else(|e| panic!("{e}"));
 }
 
@@ -108,7 +108,7 @@ impl Fit {
 
 #[test]
 fn a_lost_device_is_one_message_and_the_next_device_works() {
-    let gpu = Arc::new(Gpu::new(true).unwrap());
+    let gpu = Arc::new(gpu());
     let mut fit = Fit::new(&gpu, 100);
     (1..20).for_each(|step| fit.step(step).unwrap());
     assert!(!gpu.is_lost());
@@ -123,7 +123,7 @@ fn a_lost_device_is_one_message_and_the_next_device_works() {
     for result in [fit.device.download().map(drop), fit.device.loss().map(drop), fit.step(60)] {
         assert!(message(result).contains("was lost"));
     }
-    let mut next = Fit::new(&Arc::new(Gpu::new(true).unwrap()), 100);
+    let mut next = Fit::new(&Arc::new(gpu()), 100);
     (1..20).for_each(|step| next.step(step).unwrap());
     assert!(next.device.loss().unwrap() > 0.0);
 }
@@ -176,7 +176,7 @@ fn density_control_beyond_the_memory_is_one_message_and_keeps_the_splats() {
 
 #[test]
 fn a_submission_that_fails_loses_no_step_and_repeats_none() {
-    let gpu = Arc::new(Gpu::new(true).unwrap());
+    let gpu = Arc::new(gpu());
     // Splats as wide as the picture: their pairs outgrow the first guess, and steps are done again.
     let end = |failing: u64| {
         let mut fit = Fit::new(&gpu, 200);

@@ -25,7 +25,7 @@ struct Capture {
 
 fn capture(seed: u64, sizes: &[(u32, u32)], splats: usize) -> Capture {
     let mut rng = rng(seed);
-    let truth = random_scene(&mut rng, 60, Some(1)).widen();
+    let truth = widen(&random_scene(&mut rng, 60, Some(1)));
     let (mut targets, mut cameras) = (Vec::new(), Vec::new());
     for (k, &(width, height)) in sizes.iter().enumerate() {
         let camera = random_camera(&mut rng, width, height);
@@ -129,10 +129,6 @@ fn gpu_fit() -> GpuFit {
     GpuFit::new(shared())
 }
 
-fn gpu() -> Gpu {
-    Gpu::new(true).unwrap_or_else(|e| panic!("{e}"))
-}
-
 /// One device for the tests that change nothing about it: software adapters compile kernels for
 /// seconds.
 fn shared() -> Arc<Gpu> {
@@ -176,7 +172,7 @@ fn one_step_changes_the_state_as_on_the_cpu() {
         let (got, loss) = run(&mut gpu_fit(), &capture, steps, noise);
         assert!((loss[0] - expected_loss[0]).abs() < 1e-5, "{loss:?} vs {expected_loss:?}");
         let close = |what: &str, got: &[f32], expected: &[f32], bound: f64| {
-            let off = difference1(got, &widen1(expected), &[]);
+            let off = difference1(got, &widen(expected), &[]);
             assert!(off.relative() <= bound, "{steps} steps, {what}: {off:?}");
         };
         // Moments follow the gradients; Adam turns a gradient near zero into a whole step, so the

@@ -3,6 +3,8 @@
 
 mod common;
 
+use common::optimization::{full_step, random_adam, random_depth, random_picture, random_target};
+use common::{Convert, rng, widen};
 use glam::{DMat4, DQuat, DVec3};
 use rand::{Rng, SeedableRng};
 use rand_pcg::Pcg64Mcg;
@@ -10,7 +12,7 @@ use splat_render::fit::{Rates, Target, TargetDepth};
 use splat_render::reference::{Reference, decisions};
 use splat_render::sh::coeffs;
 use splat_render::splats::SplatArrays;
-use splat_render::stages::{AdamState, AdamStep, DepthLoss, Exposure};
+use splat_render::stages::{AdamState, AdamStep, DepthLoss, Exposure, Projected};
 use splat_render::{Camera, Image, ImageGradients, ProjectOptions, SplatGradients, Stages};
 
 const SCENES: u64 = 240;
@@ -102,11 +104,16 @@ impl Scene {
         ProjectOptions { antialiased: self.antialiased, ..ProjectOptions::default() }
     }
 
+    fn draw(&self) -> (Projected<f64>, Image<f64>) {
+        let (splats, camera) = (self.splats.params(), &self.camera);
+        let projected = Reference.project(&splats, camera, &self.options()).unwrap();
+        let image = Reference.rasterize(&projected, self.background).unwrap();
+        (projected, image)
+    }
+
     /// The loss, a fixed linear function of the picture, and the decisions taken.
     fn loss(&self) -> (f64, u64) {
-        let options = self.options();
-        let projected = Reference.project(&self.splats.params(), &self.camera, &options).unwrap();
-        let image = Reference.rasterize(&projected, self.background).unwrap();
+        let (projected, image) = self.draw();
         let mut loss = 0.0;
         for pixel in 0..image.alpha.len() {
             for c in 0..3 {
@@ -115,26 +122,18 @@ impl Scene {
             loss += image.alpha[pixel] * self.v_image.v_alpha[pixel];
             loss += image.depth[pixel] * self.v_image.v_depth[pixel];
         }
-        (loss, decisions(&self.splats.params(), &self.camera, &options, &projected))
+        (loss, decisions(&self.splats.params(), &self.camera, &self.options(), &projected))
     }
 
     fn gradients(&self) -> (SplatGradients<f64>, [f64; 3]) {
-        let options = self.options();
-        let projected = Reference.project(&self.splats.params(), &self.camera, &options).unwrap();
-        let image = Reference.rasterize(&projected, self.background).unwrap();
-        let v_projected = Reference
+        let (projected, image) = self.draw();
+        let v = Reference
             .rasterize_backward(&projected, self.background, &image, &self.v_image, false)
             .unwrap();
-        let gradients = Reference
-            .project_backward(
-                &self.splats.params(),
-                &self.camera,
-                &options,
-                &projected,
-                &v_projected,
-            )
-            .unwrap();
-        (gradients, v_projected.v_background)
+        let (splats, camera) = (self.splats.params(), &self.camera);
+        let gradients =
+            Reference.project_backward(&splats, camera, &self.options(), &projected, &v).unwrap();
+        (gradients, v.v_background)
     }
 
     fn entry(&mut self, kind: usize, index: usize) -> &mut f64 {
@@ -238,25 +237,13 @@ fn gradients_match_central_differences() {
     assert!(samples > SCENES as usize * KINDS.len() * 2, "too few samples away from kinks");
 }
 
-/// A photo with alpha and weights, a picture near it, and the loss of that picture.
+/// A photo with or without alpha and weights, and a picture of its size.
 fn photo_and_picture(seed: u64) -> (Target, Image<f64>) {
-    let mut rng = Pcg64Mcg::seed_from_u64(seed);
+    let mut rng = rng(seed);
     let (width, height) = (rng.random_range(1..18u32), rng.random_range(1..18u32));
-    let pixels = (width * height) as usize;
-    let channels = if seed.is_multiple_of(2) { 4 } else { 3 };
-    let colors = (0..pixels * channels as usize).map(|_| rng.random()).collect();
-    let weighted = seed.is_multiple_of(3);
-    let weights = weighted.then(|| (0..pixels).map(|_| rng.random_range(0.1..1.0)).collect());
-    let target = Target { weights, ..Target::new(width, height, channels, colors) };
-    let image = Image {
-        width,
-        height,
-        color: (0..pixels).map(|_| std::array::from_fn(|_| rng.random())).collect(),
-        alpha: vec![1.0; pixels],
-        depth: vec![0.0; pixels],
-        transmittance: vec![0.0; pixels],
-    };
-    (target, image)
+    let (alpha, weighted) = (seed.is_multiple_of(2), seed.is_multiple_of(3));
+    let target = random_target(&mut rng, width, height, alpha, weighted);
+    (target, widen(&random_picture(&mut rng, width, height)))
 }
 
 #[test]
@@ -339,26 +326,14 @@ fn the_exposure_s_gradients_match_central_differences() {
 fn the_depth_loss_s_gradients_match_central_differences() {
     let (mut worst, mut samples) = (0.0f64, 0);
     for seed in 0..40 {
-        let mut rng = Pcg64Mcg::seed_from_u64(seed ^ 0xdeb);
-        let (width, height) = (rng.random_range(1..18u32), rng.random_range(1..18u32));
-        let pixels = (width * height) as usize;
-        // World units of any size.
-        let unit = 10.0f64.powi(seed as i32 % 7 - 3);
-        let alpha: Vec<f64> = (0..pixels).map(|_| rng.random_range(0.2..1.0)).collect();
-        let target = TargetDepth {
-            depths: (0..pixels).map(|_| (unit * rng.random_range(0.5..2.0)) as f32).collect(),
-            confidences: (0..pixels).map(|_| rng.random_range(-0.3f32..1.0).max(0.0)).collect(),
-        };
-        let mut image = Image {
-            width,
-            height,
-            color: vec![[0.5; 3]; pixels],
-            depth: alpha.iter().map(|a| a * unit * rng.random_range(0.5..2.0)).collect(),
-            transmittance: alpha.iter().map(|a| 1.0 - a).collect(),
-            alpha,
-        };
+        let mut rng = rng(seed ^ 0xdeb);
+        let size = (rng.random_range(1..18u32), rng.random_range(1..18u32));
+        let (image, target) = random_depth(&mut rng, size);
+        let mut image = widen(&image);
+        image.depth.iter_mut().for_each(|depth| *depth *= rng.random_range(0.5..2.0));
         let loss = |image: &Image<f64>| Reference.depth_loss(image, &target).unwrap();
         let analytic = loss(&image);
+        let pixels = image.depth.len();
         for pixel in 0..pixels {
             let apart = image.depth[pixel] / (image.alpha[pixel] * f64::from(target.depths[pixel]));
             if (apart - 1.0).abs() < 1e-3 || (image.alpha[pixel] - 0.5).abs() < 1e-3 {
@@ -385,23 +360,19 @@ fn the_depth_loss_s_gradients_match_central_differences() {
     assert!(samples > 1000);
 }
 
-fn one_pixel(alpha: f64, depth: f64) -> Image<f64> {
-    Image {
-        width: 1,
-        height: 1,
-        color: vec![[0.0; 3]],
-        alpha: vec![alpha],
-        depth: vec![depth],
-        transmittance: vec![1.0 - alpha],
-    }
-}
-
 #[test]
 fn a_depth_loss_has_its_bounds() {
-    let with = |alpha: f64, depth: f64, z: f32, confidence: f32| {
+    let loss = |alpha: f64, depth: f64, z: f32, confidence: f32| {
         let target = TargetDepth { depths: vec![z], confidences: vec![confidence] };
-        Reference.depth_loss(&one_pixel(alpha, depth), &target).unwrap()
+        let image = Image {
+            alpha: vec![alpha],
+            depth: vec![depth],
+            transmittance: vec![1.0 - alpha],
+            ..widen(&random_picture(&mut rng(1), 1, 1))
+        };
+        Reference.depth_loss(&image, &target)
     };
+    let with = |alpha, depth, z, confidence| loss(alpha, depth, z, confidence).unwrap();
     // One per cent too far; on it; absurdly wrong; too clear to have a depth; not known.
     assert!((with(1.0, 2.02, 2.0, 1.0).value - 0.01).abs() < 1e-4);
     assert_eq!(
@@ -420,23 +391,15 @@ fn a_depth_loss_has_its_bounds() {
         (1.0, f32::NAN),
     ];
     for (z, confidence) in wrong {
-        let target = TargetDepth { depths: vec![z], confidences: vec![confidence] };
-        let image = one_pixel(1.0, 1.0);
-        let error = Reference.depth_loss(&image, &target).unwrap_err().to_string();
+        let error = loss(1.0, 1.0, z, confidence).unwrap_err().to_string();
         assert!(error.starts_with("target: has a depth"), "{error}");
     }
 }
 
 #[test]
 fn a_cut_color_is_only_brought_back() {
-    let image = Image {
-        width: 4,
-        height: 1,
-        color: vec![[0.9; 3], [0.9; 3], [0.05; 3], [0.05; 3]],
-        alpha: vec![1.0; 4],
-        depth: vec![0.0; 4],
-        transmittance: vec![0.0; 4],
-    };
+    let color = vec![[0.9; 3], [0.9; 3], [0.05; 3], [0.05; 3]];
+    let image = Image { color, ..widen(&random_picture(&mut rng(2), 4, 1)) };
     let exposure = Exposure { gain: [2.0; 3], offset: [-0.2; 3], background: None };
     let corrected = Reference.exposure(&image, &exposure).unwrap();
     assert_eq!(corrected, [[1.0; 3], [1.0; 3], [0.0; 3], [0.0; 3]]);
@@ -452,33 +415,23 @@ fn a_cut_color_is_only_brought_back() {
 /// are compared with differences of the regularizers.
 #[test]
 fn the_regularizers_pull_along_their_gradients() {
-    let mut rng = Pcg64Mcg::seed_from_u64(5);
     let n = 9;
-    let zeros = common::convert_arrays(&SplatArrays::zeros(n, 0), f64::from);
-    let mut splats = SplatArrays {
-        quats: vec![[1.0, 0.0, 0.0, 0.0]; n],
-        scales: (0..n).map(|_| std::array::from_fn(|_| rng.random_range(-3.0..1.0))).collect(),
-        opacities: (0..n).map(|_| rng.random_range(-4.0..4.0)).collect(),
-        ..zeros.clone()
+    let (random, gradients) = random_adam(&mut rng(5), n, 0);
+    let zero = |_: f32| 0.0f64;
+    let mut splats = widen(&random.splats);
+    let mut state = AdamState {
+        splats: splats.clone(),
+        first: random.first.convert(zero),
+        second: random.second.convert(zero),
     };
-    let mut state =
-        AdamState { splats: splats.clone(), first: zeros.clone(), second: zeros.clone() };
-    let gradients = SplatGradients {
-        v_means: zeros.means,
-        v_quats: zeros.quats,
-        v_scales: zeros.scales,
-        v_opacities: zeros.opacities,
-        v_colors: zeros.sh,
-        ..SplatGradients::default()
-    };
+    let gradients = gradients.convert(zero);
     let step = AdamStep {
         number: 1,
         rates: Rates { means: 1e-3, ..Rates::ZERO },
-        sh_degree: 0,
         opacity_regularizer: 0.25,
         scale_regularizer: 0.5,
         noise: 0.0,
-        noise_seed: 0,
+        ..full_step(0)
     };
     Reference.adam(&mut state, &gradients, &step).unwrap();
     // 0.25 times the mean opacity and 0.5 times the mean scale.

@@ -100,7 +100,8 @@ fn left_out(got: &Image<f32>, expected: &Image<f64>, band: &[bool], bound: f64) 
         color || t.abs() > bound || depth.abs() > bound
     };
     let out: Vec<bool> = (0..band.len()).map(|pixel| band[pixel] && far(pixel)).collect();
-    assert_band_is_small(&out);
+    let count = out.iter().filter(|&&out| out).count();
+    assert!(count <= (out.len() / 1000).max(1), "{count} of {} pixels are left out", out.len());
     out
 }
 
@@ -126,9 +127,9 @@ pub fn rasterize_stages(
 ) {
     let mut rng = rng(seed);
     let background = [0.2f32, 0.5, 0.9];
-    let wide = widen_projected(projected);
+    let wide = widen(projected);
     let image = stages.rasterize(projected, background).unwrap();
-    let expected = Reference.rasterize(&wide, background.map(f64::from)).unwrap();
+    let expected = Reference.rasterize(&wide, widen(&background)).unwrap();
     let left_out = left_out(&image, &expected, &band_pixels(&wide, BAND.0), bounds.picture);
     let difference = image_difference(&image, &expected, &left_out);
     println!(
@@ -150,13 +151,7 @@ pub fn rasterize_stages(
     let without = ProjectedGradients { v_means2d_absolute: None, ..v.clone() };
     assert!(without == run(false), "{what}: asking for absolute gradients changes the others");
     let expected = Reference
-        .rasterize_backward(
-            &wide,
-            background.map(f64::from),
-            &expected,
-            &widen_image_gradients(&v_image),
-            true,
-        )
+        .rasterize_backward(&wide, widen(&background), &expected, &widen(&v_image), true)
         .unwrap();
     assert_gradients(&projected_gradient_differences(&v, &expected), bounds.gradient, what);
 }
@@ -174,23 +169,15 @@ fn project_stages(
     let mut rng = rng(seed);
     let camera = &rounded(camera);
     let got = stages.project(&scene.params(), camera, options).unwrap();
-    let wide_scene = scene.widen();
+    let wide_scene = widen(scene);
     let expected = Reference.project(&wide_scene.params(), camera, options).unwrap();
-    let v = random_projected_gradients(&mut rng, &convert_projected(&expected, narrowed));
+    let v = random_projected_gradients(&mut rng, &narrow(&expected));
     let run = || stages.project_backward(&scene.params(), camera, options, &got, &v).unwrap();
     let gradients = run();
-    assert!(
-        splat_gradient_bits(&gradients) == splat_gradient_bits(&run()),
-        "{what}: gradients repeat"
-    );
+    // As text, because 0 equals -0.
+    assert_eq!(format!("{gradients:?}"), format!("{:?}", run()), "{what}: gradients repeat");
     let expected_gradients = Reference
-        .project_backward(
-            &wide_scene.params(),
-            camera,
-            options,
-            &expected,
-            &widen_projected_gradients(&v),
-        )
+        .project_backward(&wide_scene.params(), camera, options, &expected, &widen(&v))
         .unwrap();
     assert_same_culled(&got, &expected, what);
     for (name, off, bound) in [
@@ -239,8 +226,8 @@ pub fn end_to_end(
 ) {
     let camera = &rounded(camera);
     let background = [0.2f32, 0.5, 0.9];
-    let wide_scene = scene.widen();
-    let wide_background = background.map(f64::from);
+    let wide_scene = widen(scene);
+    let wide_background = widen(&background);
     let expected_projected = Reference.project(&wide_scene.params(), camera, options).unwrap();
     let band = band_pixels(&expected_projected, BAND.1);
     let expected = Reference.rasterize(&expected_projected, wide_background).unwrap();
@@ -271,7 +258,7 @@ pub fn end_to_end(
             &expected_projected,
             wide_background,
             &expected,
-            &widen_image_gradients(&v_image),
+            &widen(&v_image),
             false,
         )
         .unwrap();

@@ -386,7 +386,7 @@ pub fn a_far_away_scene_renders_as_one_at_the_origin(stages: &dyn Stages<f32>) {
     let near = pass(stages, &scene, &camera, &options, Some(9));
     let far = pass(stages, &far, &far_camera, &options, Some(9));
     let (v, v_far) = (near.v_splats, far.v_splats);
-    let off = image_difference(&far.image, &widen_image(&near.image), &[]);
+    let off = image_difference(&far.image, &widen(&near.image), &[]);
     println!("picture {off:?}");
     assert!(off.max < 1e-3, "{off:?}");
     for (what, off) in [

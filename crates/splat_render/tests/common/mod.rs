@@ -1,6 +1,30 @@
 //! Seeded random scenes, f32/f64 conversions and comparators, shared by the tests of all backends.
 #![allow(dead_code)] // Each test binary uses its own part.
 
+/// Declares the tests of the checks that need no comparison with the reference, which must pass them,
+/// too. `$values` and `$orders` are numbers of random cases.
+#[allow(unused_macros)]
+macro_rules! checks_of_all {
+    ($stages:expr; $values:expr, $orders:expr) => {
+        checks! {
+            $stages;
+            hard_cases::no_splats_give_the_background();
+            hard_cases::an_invalid_number_culls_one_splat_at_most();
+            hard_cases::a_zero_quaternion_culls_its_splat();
+            hard_cases::culled_splats_change_nothing();
+            hard_cases::a_far_away_scene_renders_as_one_at_the_origin();
+            properties::any_values_give_finite_results($values);
+            properties::the_order_of_splats_does_not_matter($orders);
+            optimization::exposure_matches_the_reference();
+            optimization::depth_loss_matches_the_reference();
+            optimization::frozen_splats_keep_their_moments();
+            agreement::invalid_2d_splats_are_not_drawn();
+            agreement::a_near_plane_of_zero_draws_what_is_before_the_camera();
+            agreement::invalid_options_are_refused();
+        }
+    };
+}
+
 /// Declares a test of each check, run on each of `$stages`.
 #[allow(unused_macros)]
 macro_rules! checks {
@@ -29,6 +53,7 @@ use rand::{Rng, SeedableRng};
 use rand_pcg::Pcg64;
 use splat_render::constants::BLUR;
 use splat_render::fit::Rates;
+use splat_render::gpu::Gpu;
 use splat_render::splats::SplatArrays;
 use splat_render::stages::{Colors, Float, Image, ImageGradients, Projected, ProjectedGradients};
 use splat_render::{Camera, ProjectOptions, SplatGradients, SplatParams, Stages};
@@ -36,6 +61,11 @@ use splat_render::{Camera, ProjectOptions, SplatGradients, SplatParams, Stages};
 /// A seeded generator.
 pub fn rng(seed: u64) -> Pcg64 {
     Pcg64::seed_from_u64(seed)
+}
+
+/// Any adapter, software ones included; if there is none, the test fails with the error's sentence.
+pub fn gpu() -> Gpu {
+    Gpu::new(true).unwrap_or_else(|e| panic!("{e}"))
 }
 
 /// Runs work on a number of threads.
@@ -96,10 +126,6 @@ impl Scene<f32> {
             sh_degree: self.sh_degree,
         }
     }
-
-    pub fn widen(&self) -> Scene<f64> {
-        narrowed::widened(&self.params())
-    }
 }
 
 /// The picture of splats.
@@ -114,7 +140,7 @@ pub fn render<T: Float>(
 }
 
 /// Results of the four stages.
-#[derive(PartialEq)]
+#[derive(Debug, PartialEq)]
 pub struct Pass {
     pub projected: Projected<f32>,
     pub image: Image<f32>,
@@ -379,16 +405,6 @@ pub fn image_difference(got: &Image<f32>, expected: &Image<f64>, band: &[bool]) 
         .join(depth)
 }
 
-/// Asserts that at most 0.1 % of the pixels (or one, in pictures of under 1 000) are in the band.
-pub fn assert_band_is_small(band: &[bool]) {
-    let count = band.iter().filter(|&&b| b).count();
-    assert!(
-        count <= (band.len() / 1000).max(1),
-        "{count} of {} pixels are in the band",
-        band.len()
-    );
-}
-
 /// Gradients of the 2D splats, kind by kind.
 pub fn projected_gradient_differences(
     got: &ProjectedGradients<f32>,
@@ -446,19 +462,4 @@ pub fn assert_gradients(differences: &[(&'static str, Difference)], bound: f64, 
             difference.scale
         );
     }
-}
-
-/// Bits of every gradient, for exact comparisons.
-pub fn splat_gradient_bits(g: &SplatGradients<f32>) -> Vec<u64> {
-    let singles = g
-        .v_means
-        .as_flattened()
-        .iter()
-        .chain(g.v_quats.as_flattened())
-        .chain(g.v_scales.as_flattened())
-        .chain(&g.v_opacities)
-        .chain(g.v_colors.as_flattened())
-        .map(|v| u64::from(v.to_bits()));
-    let doubles = g.v_viewmat.as_flattened().iter().chain(&g.v_intrinsics).map(|v| v.to_bits());
-    singles.chain(doubles).collect()
 }

@@ -22,7 +22,7 @@ pub fn widened(splats: &SplatParams<'_, f32>) -> Scene<f64> {
         means: widen(splats.means),
         quats: widen(splats.quats),
         scales: widen(splats.scales),
-        opacities: widen1(splats.opacities),
+        opacities: widen(splats.opacities),
         colors: widen(colors),
         sh_degree,
         sh_stride,
@@ -37,8 +37,7 @@ impl Stages<f32> for Narrowed {
         camera: &Camera,
         options: &ProjectOptions,
     ) -> Result<Projected<f32>> {
-        let projected = Reference.project(&widened(splats).params(), camera, options)?;
-        Ok(convert_projected(&projected, narrowed))
+        Ok(narrow(&Reference.project(&widened(splats).params(), camera, options)?))
     }
 
     fn rasterize_unchecked(
@@ -46,8 +45,7 @@ impl Stages<f32> for Narrowed {
         projected: &Projected<f32>,
         background: [f32; 3],
     ) -> Result<Image<f32>> {
-        let image = Reference.rasterize(&widen_projected(projected), background.map(f64::from))?;
-        Ok(convert_image(&image, narrowed))
+        Ok(narrow(&Reference.rasterize(&widen(projected), widen(&background))?))
     }
 
     fn rasterize_backward_unchecked(
@@ -59,13 +57,13 @@ impl Stages<f32> for Narrowed {
         absolute: bool,
     ) -> Result<ProjectedGradients<f32>> {
         let v = Reference.rasterize_backward(
-            &widen_projected(projected),
-            background.map(f64::from),
-            &widen_image(image),
-            &widen_image_gradients(v_image),
+            &widen(projected),
+            widen(&background),
+            &widen(image),
+            &widen(v_image),
             absolute,
         )?;
-        Ok(convert_projected_gradients(&v, narrowed))
+        Ok(narrow(&v))
     }
 
     fn project_backward_unchecked(
@@ -80,10 +78,10 @@ impl Stages<f32> for Narrowed {
             &widened(splats).params(),
             camera,
             options,
-            &widen_projected(projected),
-            &widen_projected_gradients(v_projected),
+            &widen(projected),
+            &widen(v_projected),
         )?;
-        Ok(convert_splat_gradients(&v, narrowed))
+        Ok(narrow(&v))
     }
 
     fn exposure_unchecked(
@@ -91,7 +89,7 @@ impl Stages<f32> for Narrowed {
         image: &Image<f32>,
         exposure: &Exposure<f32>,
     ) -> Result<Vec<[f32; 3]>> {
-        Ok(narrow(&Reference.exposure(&widen_image(image), &widen_exposure(exposure))?))
+        Ok(narrow(&Reference.exposure(&widen(image), &widen(exposure))?))
     }
 
     fn exposure_backward_unchecked(
@@ -100,14 +98,8 @@ impl Stages<f32> for Narrowed {
         exposure: &Exposure<f32>,
         v_corrected: &[[f32; 3]],
     ) -> Result<ExposureGradients<f32>> {
-        let (image, exposure) = (widen_image(image), widen_exposure(exposure));
-        let v = Reference.exposure_backward(&image, &exposure, &widen(v_corrected))?;
-        Ok(ExposureGradients {
-            v_color: narrow(&v.v_color),
-            v_alpha: narrow1(&v.v_alpha),
-            v_gain: v.v_gain,
-            v_offset: v.v_offset,
-        })
+        let (image, exposure) = (widen(image), widen(exposure));
+        Ok(narrow(&Reference.exposure_backward(&image, &exposure, &widen(v_corrected))?))
     }
 
     fn depth_loss_unchecked(
@@ -115,12 +107,7 @@ impl Stages<f32> for Narrowed {
         image: &Image<f32>,
         target: &TargetDepth,
     ) -> Result<DepthLoss<f32>> {
-        let loss = Reference.depth_loss(&widen_image(image), target)?;
-        Ok(DepthLoss {
-            value: narrowed(loss.value),
-            v_alpha: narrow1(&loss.v_alpha),
-            v_depth: narrow1(&loss.v_depth),
-        })
+        Ok(narrow(&Reference.depth_loss(&widen(image), target)?))
     }
 
     fn loss_unchecked(
@@ -130,9 +117,7 @@ impl Stages<f32> for Narrowed {
         background: [f32; 3],
         ssim_weight: f32,
     ) -> Result<Loss<f32>> {
-        let background = background.map(f64::from);
-        let loss = Reference.loss(&widen_image(image), target, background, ssim_weight)?;
-        Ok(Loss { value: narrowed(loss.value), v_color: narrow(&loss.v_color) })
+        Ok(narrow(&Reference.loss(&widen(image), target, widen(&background), ssim_weight)?))
     }
 
     fn adam_unchecked(
@@ -141,9 +126,9 @@ impl Stages<f32> for Narrowed {
         gradients: &SplatGradients<f32>,
         step: &AdamStep,
     ) -> Result<()> {
-        let mut wide = widen_adam_state(state);
-        Reference.adam(&mut wide, &widen_splat_gradients(gradients), step)?;
-        *state = convert_adam_state(&wide, narrowed);
+        let mut wide = widen(state);
+        Reference.adam(&mut wide, &widen(gradients), step)?;
+        *state = narrow(&wide);
         Ok(())
     }
 }

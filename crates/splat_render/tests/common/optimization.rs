@@ -57,9 +57,8 @@ pub fn loss_matches_the_reference(stages: &dyn Stages<f32>) {
             let image = random_picture(&mut rng, width, height);
             let what = format!("{width}x{height}, SSIM {ssim_weight}");
             let got = stages.loss(&image, &target, background, ssim_weight).unwrap();
-            let wide = background.map(f64::from);
-            let expected =
-                Reference.loss(&widen_image(&image), &target, wide, ssim_weight).unwrap();
+            let wide = widen(&background);
+            let expected = Reference.loss(&widen(&image), &target, wide, ssim_weight).unwrap();
             let off = (f64::from(got.value) - expected.value).abs();
             let gradient = difference(&got.v_color, &expected.v_color, &[]).relative();
             println!("{what}: loss off by {off:.1e}, gradient by {gradient:.1e} of the largest");
@@ -98,7 +97,7 @@ pub fn exposure_matches_the_reference(stages: &dyn Stages<f32>) {
     for size in [(23, 37), (1, 1), (130, 7), (300, 200)] {
         for matted in [false, true] {
             let (image, exposure, v) = random_exposure(&mut rng, size, matted);
-            let (wide_image, wide) = (widen_image(&image), widen_exposure(&exposure));
+            let (wide_image, wide) = (widen(&image), widen(&exposure));
             let what = format!("{size:?}, alpha {matted}");
             let got = stages.exposure(&image, &exposure).unwrap();
             let expected = Reference.exposure(&wide_image, &wide).unwrap();
@@ -159,7 +158,7 @@ pub fn depth_loss_matches_the_reference(stages: &dyn Stages<f32>) {
     for size in [(23, 37), (1, 1), (130, 7), (300, 200)] {
         let (image, target) = random_depth(&mut rng, size);
         let got = stages.depth_loss(&image, &target).unwrap();
-        let expected = Reference.depth_loss(&widen_image(&image), &target).unwrap();
+        let expected = Reference.depth_loss(&widen(&image), &target).unwrap();
         let off = (f64::from(got.value) - expected.value).abs();
         let of_alpha = difference1(&got.v_alpha, &expected.v_alpha, &[]).relative();
         let of_depth = difference1(&got.v_depth, &expected.v_depth, &[]).relative();
@@ -243,8 +242,8 @@ pub fn adam_matches_the_reference(stages: &dyn Stages<f32>) {
             *opacity = -7.0;
         }
         state.splats.quats[n / 2] = [0.0; 4];
-        let (before, mut expected) = (state.clone(), widen_adam_state(&state));
-        let wide = widen_splat_gradients(&gradients);
+        let (before, mut expected) = (state.clone(), widen(&state));
+        let wide = widen(&gradients);
         let step = full_step(used);
         stages.adam(&mut state, &gradients, &step).unwrap();
         Reference.adam(&mut expected, &wide, &step).unwrap();

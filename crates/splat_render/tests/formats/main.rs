@@ -2,6 +2,7 @@
 
 mod hostile;
 mod layouts;
+mod levels;
 mod memory;
 mod mutations;
 mod notes;

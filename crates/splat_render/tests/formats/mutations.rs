@@ -3,6 +3,7 @@
 //!
 //! `IGSR_FUZZ_CASES` is the number of cases per file; `make fuzz` sets it high.
 
+use std::convert::identity;
 use std::io::{Read, Write};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
@@ -27,7 +28,7 @@ const TIME_MAX: Duration = Duration::from_secs(10);
 const EDGES: [u64; 10] = [0, 1, 2, 0x7f, 0xff, 0xffff, 0x7fff_ffff, 0xffff_ffff, 1 << 32, u64::MAX];
 
 /// Changes some bytes, a length, a digit, or the length of all.
-fn mutate(bytes: &mut Vec<u8>, numbers: &mut Numbers) {
+pub fn mutate(bytes: &mut Vec<u8>, numbers: &mut Numbers) {
     for _ in 0..=numbers.below(3) {
         let at = numbers.below(bytes.len());
         match numbers.below(8) {
@@ -114,33 +115,29 @@ fn run(name: &str, seed_bytes: &[u8], wrap: impl Fn(Vec<u8>) -> Vec<u8>) {
     assert!(refused > 0, "no change to {name} was found out");
 }
 
-fn as_it_is(bytes: Vec<u8>) -> Vec<u8> {
-    bytes
-}
-
 #[test]
 fn ply() {
     let folder = folder("mutate-ply");
-    run("mutated.ply", &bytes_of(&folder, "ply", &scene(4, 1)), as_it_is);
+    run("mutated.ply", &bytes_of(&folder, "ply", &scene(4, 1)), identity);
 }
 
 #[test]
 fn compressed_ply() {
     let folder = folder("mutate-compressed");
     let bytes = bytes_of(&folder, "compressed.ply", &scene(4, 1));
-    run("mutated.compressed.ply", &bytes, as_it_is);
+    run("mutated.compressed.ply", &bytes, identity);
 }
 
 #[test]
 fn splat() {
-    run("mutated.splat", &bytes_of(&folder("mutate-splat"), "splat", &scene(4, 0)), as_it_is);
+    run("mutated.splat", &bytes_of(&folder("mutate-splat"), "splat", &scene(4, 0)), identity);
 }
 
 #[test]
 fn ksplat_of_all_levels() {
     for level in 0..3 {
         let name = format!("mutated{level}.ksplat");
-        run(&name, &ksplat(&scene(5, 2), level), as_it_is);
+        run(&name, &ksplat(&scene(5, 2), level), identity);
         // The headers are mostly empty: change the used parts more often.
         let whole = ksplat(&scene(5, 2), level);
         run(&name, &whole[4096..4096 + 48], |section| {
@@ -156,7 +153,7 @@ fn ksplat_of_all_levels() {
 fn spz() {
     let folder = folder("mutate-spz");
     let three = bytes_of(&folder, "spz", &scene(4, 1));
-    run("mutated.spz", &three, as_it_is);
+    run("mutated.spz", &three, identity);
     let zipped = |bytes: Vec<u8>| {
         let mut gzip = GzEncoder::new(Vec::new(), Compression::fast());
         gzip.write_all(&bytes).unwrap();
@@ -166,13 +163,13 @@ fn spz() {
     GzDecoder::new(three.as_slice()).read_to_end(&mut payload).unwrap();
     run("payload.spz", &payload, zipped);
     run("two.spz", &spz_2(&scene(4, 1).splats), zipped);
-    run("four.spz", &spz_4(&scene(4, 1).splats), as_it_is);
+    run("four.spz", &spz_4(&scene(4, 1).splats), identity);
 }
 
 #[test]
 fn sog() {
     let whole = bytes_of(&folder("mutate-sog"), "sog", &scene(4, 1));
-    run("mutated.sog", &whole, as_it_is);
+    run("mutated.sog", &whole, identity);
     let entries = sog_entries(&whole);
     for (name, bytes) in &entries {
         let changed = name.replace("webp", "sog").replace("json", "sog");
@@ -189,6 +186,6 @@ fn gltf() {
     let folder = folder("mutate-gltf");
     for ending in ["glb", "gltf"] {
         let name = format!("mutated.{ending}");
-        run(&name, &bytes_of(&folder, ending, &scene(2, 1)), as_it_is);
+        run(&name, &bytes_of(&folder, ending, &scene(2, 1)), identity);
     }
 }

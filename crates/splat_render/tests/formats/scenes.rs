@@ -73,12 +73,12 @@ pub fn bytes_of(folder: &Path, ending: &str, file: &SplatFile) -> Vec<u8> {
 /// The largest differences between two scenes of the same size, each splat paired with its nearest.
 #[derive(Debug, Default)]
 pub struct Apart {
-    pub mean: f32,
-    pub scale: f32,
-    pub quat: f32,
+    pub mean: f64,
+    pub scale: f64,
+    pub quat: f64,
     pub opacity: f64,
     pub color: f64,
-    pub rest: f32,
+    pub rest: f64,
     /// Root mean square of the differences whose maximum is `rest`.
     pub rest_rms: f64,
 }
@@ -91,6 +91,7 @@ impl Apart {
         let mut apart = Self::default();
         let mut used = vec![false; before.len()];
         let (mut squares, mut count) = (0.0, 0);
+        let off = |a: f32, b: f32| f64::from((a - b).abs());
         for j in 0..after.len() {
             let far = |i: usize| -> f32 {
                 (0..3).map(|k| (before.means[i][k] - after.means[j][k]).powi(2)).sum()
@@ -98,9 +99,9 @@ impl Apart {
             let i = (0..before.len()).min_by(|&a, &b| far(a).total_cmp(&far(b))).unwrap();
             assert!(!std::mem::replace(&mut used[i], true), "two splats came back as one");
             for k in 0..3 {
-                apart.mean = apart.mean.max((before.means[i][k] - after.means[j][k]).abs());
-                apart.scale = apart.scale.max((before.scales[i][k] - after.scales[j][k]).abs());
-                let color = f64::from(before.sh[i * stride][k] - after.sh[j * stride][k]).abs();
+                apart.mean = apart.mean.max(off(before.means[i][k], after.means[j][k]));
+                apart.scale = apart.scale.max(off(before.scales[i][k], after.scales[j][k]));
+                let color = off(before.sh[i * stride][k], after.sh[j * stride][k]);
                 apart.color = apart.color.max(color * C0);
             }
             apart.quat = apart.quat.max(quats_apart(before.quats[i], after.quats[j]));
@@ -109,9 +110,9 @@ impl Apart {
             apart.opacity = apart.opacity.max(opacities.abs());
             for k in 1..stride {
                 for c in 0..3 {
-                    let rest = before.sh[i * stride + k][c] - after.sh[j * stride + k][c];
-                    apart.rest = apart.rest.max(rest.abs());
-                    squares += f64::from(rest).powi(2);
+                    let rest = off(before.sh[i * stride + k][c], after.sh[j * stride + k][c]);
+                    apart.rest = apart.rest.max(rest);
+                    squares += rest.powi(2);
                     count += 1;
                 }
             }
@@ -119,14 +120,22 @@ impl Apart {
         apart.rest_rms = (squares / f64::from(count.max(1))).sqrt();
         apart
     }
+
+    /// Asserts that no difference is larger than that of `most`.
+    pub fn assert_within(&self, most: &Self, what: &str) {
+        let all = |a: &Self| [a.mean, a.scale, a.quat, a.opacity, a.color, a.rest];
+        let within = all(self).iter().zip(all(most)).all(|(off, most)| *off <= most);
+        assert!(within, "{what}: {self:?} where {most:?} is allowed");
+    }
 }
 
-fn quats_apart(a: [f32; 4], b: [f32; 4]) -> f32 {
-    let unit = |q: [f32; 4]| {
-        let norm = q.iter().map(|c| c * c).sum::<f32>().sqrt();
-        q.map(|c| c / norm)
-    };
+pub fn unit(quat: [f32; 4]) -> [f32; 4] {
+    let norm = quat.iter().map(|c| c * c).sum::<f32>().sqrt();
+    quat.map(|c| c / norm)
+}
+
+fn quats_apart(a: [f32; 4], b: [f32; 4]) -> f64 {
     let (a, b) = (unit(a), unit(b));
     let sign = (0..4).map(|k| a[k] * b[k]).sum::<f32>().signum();
-    (0..4).map(|k| (a[k] - sign * b[k]).powi(2)).sum::<f32>().sqrt()
+    f64::from((0..4).map(|k| (a[k] - sign * b[k]).powi(2)).sum::<f32>().sqrt())
 }

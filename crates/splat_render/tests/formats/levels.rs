@@ -9,39 +9,15 @@ use splat_render::levels::{
     INDEX, LevelsWritten, Manifest, Resident, coarsest, read_within, write_levels,
 };
 
-/// A folder that goes away with this.
-struct Folder(PathBuf);
+use crate::mutations::mutate;
+use crate::scenes::{Numbers, folder};
 
-impl Folder {
-    fn new(name: &str) -> Self {
-        let path = std::env::temp_dir().join(format!("levels-{name}-{}", std::process::id()));
-        let _ = std::fs::remove_dir_all(&path);
-        std::fs::create_dir_all(&path).expect("a folder");
-        Self(path)
-    }
-
-    fn join(&self, name: &str) -> PathBuf {
-        self.0.join(name)
-    }
-
-    /// The folder of the levels.
-    fn out(&self) -> PathBuf {
-        self.join("out")
-    }
-
-    /// Writes a scene and its levels, in cells of about 100 splats.
-    fn write(&self, file: &SplatFile, levels: usize) -> LevelsWritten {
-        write_splats(&self.join("scene.ply"), file).expect("a scene");
-        std::fs::create_dir(self.out()).expect("a folder");
-        let written = write_levels(&self.join("scene.ply"), &self.out(), levels, 100, &mut || true);
-        written.expect("levels").expect("all of it")
-    }
-}
-
-impl Drop for Folder {
-    fn drop(&mut self) {
-        let _ = std::fs::remove_dir_all(&self.0);
-    }
+/// Writes a scene to the folder, and its levels to the folder's `out`, in cells of about 100 splats.
+fn write(folder: &Path, file: &SplatFile, levels: usize) -> LevelsWritten {
+    let (scene, out) = (folder.join("scene.ply"), folder.join("out"));
+    write_splats(&scene, file).expect("a scene");
+    std::fs::create_dir(&out).expect("a folder");
+    write_levels(&scene, &out, levels, 100, &mut || true).expect("levels").expect("all of it")
 }
 
 /// A field of splats, of SH degree 1, whose color changes along it.
@@ -61,30 +37,30 @@ fn field() -> SplatFile {
     SplatFile { splats, origin: [1000.5, 0.0, -7.0], antialiased: true }
 }
 
-/// Levels of the field in a new folder: three of them, in cells of about 100.
-fn written(name: &str) -> Folder {
-    let folder = Folder::new(name);
-    let done = folder.write(&field(), 3);
+/// A new folder of three levels of the field, in cells of about 100.
+fn written(name: &str) -> PathBuf {
+    let folder = folder(name);
+    let done = write(&folder, &field(), 3);
     assert_eq!(done.counts[0], 1600);
     assert!((250..=450).contains(&done.counts[1]), "{done:?}");
     assert!((40..=120).contains(&done.counts[2]), "{done:?}");
     assert_eq!(done.cells, 16);
-    folder
+    folder.join("out")
 }
 
-fn index(folder: &Folder) -> Value {
-    let text = std::fs::read(folder.out().join(INDEX)).expect("an index");
+fn index(folder: &Path) -> Value {
+    let text = std::fs::read(folder.join(INDEX)).expect("an index");
     serde_json::from_slice(&text).expect("JSON")
 }
 
-fn store(folder: &Folder, index: &Value) {
-    std::fs::write(folder.out().join(INDEX), index.to_string()).expect("an index");
+fn store(folder: &Path, index: &Value) {
+    std::fs::write(folder.join(INDEX), index.to_string()).expect("an index");
 }
 
 #[test]
 fn each_budget_gives_the_finest_level_that_fits() {
     let folder = written("round");
-    let (all, level) = read_within(&folder.out(), 1600).expect("levels");
+    let (all, level) = read_within(&folder, 1600).expect("levels");
     assert_eq!((all.splats.len(), level), (1600, 0));
     assert_eq!((all.origin, all.antialiased), ([1000.5, 0.0, -7.0], true));
     let sorted = |splats: &SplatArrays| {
@@ -94,10 +70,10 @@ fn each_budget_gives_the_finest_level_that_fits() {
         rows
     };
     assert_eq!(sorted(&all.splats), sorted(&field().splats));
-    let (some, level) = read_within(&folder.out(), 1599).expect("levels");
+    let (some, level) = read_within(&folder, 1599).expect("levels");
     assert_eq!(level, 1);
     assert!(some.splats.len() < 450);
-    let error = read_within(&folder.out(), 20).map(|_| ()).expect_err("too few").to_string();
+    let error = read_within(&folder, 20).map(|_| ()).expect_err("too few").to_string();
     assert!(error.contains("coarsest level"), "{error}");
 }
 
@@ -133,7 +109,7 @@ fn the_files_have_the_published_layout() {
     }
     walk(&index["tree"]);
     // Runs cover each file, and a file has one level.
-    let manifest = Manifest::read(&folder.out()).expect("a manifest");
+    let manifest = Manifest::read(&folder).expect("a manifest");
     for (file, name) in manifest.files.iter().enumerate() {
         let mut runs: Vec<(usize, usize, usize)> = Vec::new();
         for cell in &manifest.cells {
@@ -147,20 +123,20 @@ fn the_files_have_the_published_layout() {
             assert_eq!((*offset, *level), (end, runs[0].2));
             end += count;
         }
-        let path = folder.out().join(name.to_str().expect("a name"));
+        let path = folder.join(name.to_str().expect("a name"));
         let meta: Value =
             serde_json::from_slice(&std::fs::read(path).expect("a SOG")).expect("JSON");
         assert_eq!(meta["count"].as_u64(), Some(end as u64));
     }
-    assert!(!folder.join("out/.cells").exists());
+    assert!(!folder.join(".cells").exists());
 }
 
 #[test]
 fn the_same_scene_gives_the_same_files() {
     let (one, other) = (written("one"), written("other"));
-    let files = |folder: &Folder| {
+    let files = |folder: &PathBuf| {
         let mut all = Vec::new();
-        for entry in std::fs::read_dir(folder.out()).expect("a folder").flatten() {
+        for entry in std::fs::read_dir(folder).expect("a folder").flatten() {
             match std::fs::read_dir(entry.path()) {
                 Ok(inner) => all.extend(inner.flatten().map(|e| e.path())),
                 Err(_) => all.push(entry.path()),
@@ -169,7 +145,7 @@ fn the_same_scene_gives_the_same_files() {
         all.sort();
         let read = |path: PathBuf| {
             let bytes = std::fs::read(&path).expect("bytes");
-            (path.strip_prefix(&folder.0).expect("inside").to_owned(), bytes)
+            (path.strip_prefix(folder).expect("inside").to_owned(), bytes)
         };
         all.into_iter().map(read).collect::<Vec<_>>()
     };
@@ -178,13 +154,13 @@ fn the_same_scene_gives_the_same_files() {
 
 #[test]
 fn invalid_scenes_and_numbers_are_refused() {
-    let folder = Folder::new("refused");
+    let folder = folder("refused");
     let scene = folder.join("scene.ply");
     let mut file = field();
     file.splats.means.fill([f32::NAN; 3]);
     write_splats(&scene, &file).expect("a scene");
     let say = |scene: &Path, levels, per_cell| {
-        write_levels(scene, &folder.0, levels, per_cell, &mut || true)
+        write_levels(scene, &folder, levels, per_cell, &mut || true)
             .expect_err("refused")
             .to_string()
     };
@@ -201,7 +177,7 @@ fn invalid_scenes_and_numbers_are_refused() {
 
 #[test]
 fn writing_stops_on_request() {
-    let folder = Folder::new("stop");
+    let folder = folder("stop");
     write_splats(&folder.join("scene.ply"), &field()).expect("a scene");
     // While cells are found, while they are filled, before the first is merged, and after some.
     for asked in [0, 1, 2, 3] {
@@ -221,11 +197,11 @@ fn writing_stops_on_request() {
 
 #[test]
 fn invalid_splats_are_left_out_and_counted() {
-    let folder = Folder::new("left");
+    let folder = folder("left");
     let mut file = field();
     file.splats.opacities[7] = f32::NAN;
     file.splats.quats[9] = [0.0; 4];
-    let done = folder.write(&file, 2);
+    let done = write(&folder, &file, 2);
     assert_eq!(done.counts[0], 1598);
     assert!(done.notes[0].starts_with("2 splats"), "{:?}", done.notes);
 }
@@ -268,7 +244,7 @@ fn an_invalid_index_is_one_message_that_names_it() {
         let mut index = whole.clone();
         change(&mut index);
         store(&folder, &index);
-        let error = Manifest::read(&folder.out()).expect_err(words).to_string();
+        let error = Manifest::read(&folder).expect_err(words).to_string();
         assert!(error.contains(words) && error.contains(INDEX), "{words}: {error}");
         assert_eq!(error.lines().count(), 1);
     }
@@ -279,7 +255,7 @@ fn an_invalid_index_is_one_message_that_names_it() {
     }
     index["environment"] = Value::Null;
     store(&folder, &index);
-    let manifest = Manifest::read(&folder.out()).expect("an older index");
+    let manifest = Manifest::read(&folder).expect("an older index");
     assert_eq!((manifest.cells.len(), manifest.origin), (16, [0.0; 3]));
     assert!(manifest.cells.iter().all(|c| c.errors[0] == 0.0 && c.errors[2] > c.errors[1]));
 }
@@ -288,24 +264,12 @@ fn an_invalid_index_is_one_message_that_names_it() {
 fn damaged_bytes_of_an_index_never_panic() {
     let folder = written("bytes");
     let text = index(&folder).to_string().into_bytes();
-    let mut state = 7u64;
-    let mut next = |below: usize| {
-        state =
-            state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        (state >> 33) as usize % below
-    };
+    let mut numbers = Numbers(7);
     for _ in 0..2000 {
         let mut bytes = text.clone();
-        for _ in 0..=next(3) {
-            let at = next(bytes.len());
-            match next(3) {
-                0 => bytes[at] = b"0123456789-.,[]{}\":e"[next(20)],
-                1 => drop(bytes.remove(at)),
-                _ => bytes.truncate(at.max(1)),
-            }
-        }
-        std::fs::write(folder.out().join(INDEX), &bytes).expect("an index");
-        if let Ok(manifest) = Manifest::read(&folder.out()) {
+        mutate(&mut bytes, &mut numbers);
+        std::fs::write(folder.join(INDEX), &bytes).expect("an index");
+        if let Ok(manifest) = Manifest::read(&folder) {
             // Numbers that were accepted are within the files, or reported on reading.
             let mut resident = Resident::new(&manifest, 10_000).expect("no environment");
             let choice = coarsest(&manifest, resident.room());
@@ -318,14 +282,14 @@ fn damaged_bytes_of_an_index_never_panic() {
     // Deep nesting is an error, too, and not a stack that ends.
     let deep = "{\"children\":[".repeat(100_000);
     let index = format!("{{\"version\":1,\"lodLevels\":1,\"filenames\":[],\"tree\":{deep}");
-    std::fs::write(folder.out().join(INDEX), index).expect("an index");
-    Manifest::read(&folder.out()).expect_err("too deep");
+    std::fs::write(folder.join(INDEX), index).expect("an index");
+    Manifest::read(&folder).expect_err("too deep");
 }
 
 #[test]
 fn missing_and_wrong_files_are_named() {
     let folder = written("files");
-    let say = || read_within(&folder.out(), 2000).map(|_| ()).expect_err("damage").to_string();
+    let say = || read_within(&folder, 2000).map(|_| ()).expect_err("damage").to_string();
     // More than the index says, then fewer.
     let whole = index(&folder);
     let mut other = whole.clone();
@@ -338,7 +302,7 @@ fn missing_and_wrong_files_are_named() {
         assert!(error.contains(&words) && error.contains("0_0"), "{error}");
     }
     store(&folder, &whole);
-    let meta = folder.join("out/0_0/meta.json");
+    let meta = folder.join("0_0/meta.json");
     let text = std::fs::read_to_string(&meta).expect("text");
     for (old, new, words) in [
         ("means_l.webp", "../0_1/means_l.webp", "another folder"),
