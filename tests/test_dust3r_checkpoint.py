@@ -151,7 +151,8 @@ def test_missing_keys_and_wrong_shapes_are_refused_by_name(tmp_path):
         assert key in refusal(saved(path, {**weights, key: value}))
 
 
-def test_unknown_keys_are_listed(tmp_path):
+def test_unknown_keys_are_listed(tmp_path, monkeypatch):
+    monkeypatch.setattr(igsr.cameras.dust3r.checkpoint, "_license_shown", True)
     more = {f"downstream_head1.act_{n}_postprocess.weight": torch.zeros(3) for n in range(30)}
     path = saved(tmp_path / "a.pth", {**small_weights(), **more, 7: torch.zeros(1)})
     assert "that are not text" in refusal(path)
