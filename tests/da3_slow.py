@@ -1,7 +1,7 @@
 """A slow implementation of Depth Anything 3 in float64 and numpy, to compare the network with.
 
 It follows the description of the network, not ``igsr.cameras.da3``: matrix products, not fused
-kernels, sums over shifted images, not convolutions, complex numbers, not rotated pairs.
+kernels, and complex numbers, not rotated pairs. Only convolutions are torch's.
 """
 
 from __future__ import annotations
@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import torch
+from torch.nn import functional
 
 erf = np.vectorize(math.erf)
 
@@ -36,6 +38,8 @@ class SlowDa3:
         grids = [(view.shape[1] // 14, view.shape[2] // 14) for view in views]
         tokens = [self.embedded(view, *grid) for view, grid in zip(views, grids, strict=True)]
         order = [reference] + [n for n in range(len(views)) if n != reference]
+        first, other = self.w["backbone.pretrained.camera_token"][0]
+        camera_tokens = [first] + [other] * (len(views) - 1)
         if encodings is not None:
             order = list(range(len(views)))
             camera_tokens = self.encoded(encodings)
@@ -44,12 +48,8 @@ class SlowDa3:
         for n in range(12):
             name = f"backbone.pretrained.blocks.{n}"
             if n == 4:
-                for at, one in enumerate(tokens):
-                    one[0] = (
-                        self.w["backbone.pretrained.camera_token"][0, 0 if at == 0 else 1]
-                        if encodings is None
-                        else camera_tokens[at]
-                    )
+                for one, token in zip(tokens, camera_tokens, strict=True):
+                    one[0] = token
             if n < 5 or n % 2 == 0:
                 places = [self.places(*grids[view]) if n > 3 else None for view in order]
                 tokens = [
@@ -59,9 +59,8 @@ class SlowDa3:
                 local = tokens
                 continue
             places = [np.minimum(self.places(*grids[view]), 1) for view in order]
-            whole = self.block(
-                name, np.concatenate(tokens), self.heads, 1e-6, np.concatenate(places)
-            )
+            places = np.concatenate(places)
+            whole = self.block(name, np.concatenate(tokens), self.heads, 1e-6, places)
             tokens = np.split(whole, np.cumsum([len(one) for one in tokens])[:-1])
             for at, view in enumerate(order):
                 features[view].append((local[at], tokens[at]))
@@ -81,8 +80,7 @@ class SlowDa3:
         return np.concatenate([first, patches + places])
 
     def places(self, rows, columns):
-        patches = [(r + 1, c + 1) for r in range(rows) for c in range(columns)]
-        return np.array([(0, 0), *patches])
+        return np.array([(0, 0), *(np.argwhere(np.ones((rows, columns))) + 1)])
 
     def block(self, name, x, heads, eps, places=None):
         w, dim = self.w, x.shape[1] // heads
@@ -135,13 +133,8 @@ class SlowDa3:
         x = np.concatenate([pairs[-1][0][0], pairs[-1][1][0]])
         for n in (0, 2):
             x = np.maximum(self.linear(f"cam_dec.backbone.{n}", x), 0.0)
-        pose = np.concatenate(
-            [
-                self.linear("cam_dec.fc_t", x),
-                self.linear("cam_dec.fc_qvec", x),
-                np.maximum(self.linear("cam_dec.fc_fov.0", x), 0.0),
-            ]
-        )
+        place, turn, fov = (self.linear(f"cam_dec.fc_{n}", x) for n in ("t", "qvec", "fov.0"))
+        pose = np.concatenate([place, turn, np.maximum(fov, 0.0)])
         return depth, 1 + confidence, np.moveaxis(rays[:6], 0, -1), 1 + np.exp(rays[6]), pose
 
     def joined(self, levels, chain):
@@ -168,18 +161,10 @@ class SlowDa3:
         return scaled * self.w[f"{name}.weight"] + self.w[f"{name}.bias"]
 
     def conv(self, name, x):
-        """A convolution as wide as its input, as a sum over shifts of it."""
-        kernel = self.w[f"{name}.weight"]
-        reach = kernel.shape[-1] // 2
-        height, width = x.shape[1:]
-        padded = np.pad(x, ((0, 0), (reach, reach), (reach, reach)))
-        total = np.zeros((len(kernel), height, width))
-        for i in range(kernel.shape[2]):
-            for j in range(kernel.shape[3]):
-                shifted = padded[:, i : i + height, j : j + width]
-                total += np.tensordot(kernel[:, :, i, j], shifted, axes=1)
-        bias = self.w.get(f"{name}.bias")
-        return total if bias is None else total + bias[:, None, None]
+        """A convolution as wide as its input."""
+        kernel, bias = torch.from_numpy(self.w[f"{name}.weight"]), self.w.get(f"{name}.bias")
+        out = functional.conv2d(torch.from_numpy(x)[None], kernel, padding="same")[0].numpy()
+        return out if bias is None else out + bias[:, None, None]
 
     def spread(self, name, x):
         """A transposed convolution without overlap: each pixel becomes a tile."""
@@ -213,25 +198,19 @@ def placed(x, aspect):
     v = np.linspace(-1, 1, height) / diagonal * (height - 1) / height
     q = channels // 4
     waves = 100.0 ** (-np.arange(q) / q)
-    across = np.concatenate([np.sin(np.outer(waves, u)), np.cos(np.outer(waves, u))])
-    down = np.concatenate([np.sin(np.outer(waves, v)), np.cos(np.outer(waves, v))])
-    return x + 0.1 * np.concatenate(
-        [
-            np.broadcast_to(across[:, None, :], (2 * q, height, width)),
-            np.broadcast_to(down[:, :, None], (2 * q, height, width)),
-        ]
+    across, down = (
+        np.concatenate([np.sin(np.outer(waves, w)), np.cos(np.outer(waves, w))]) for w in (u, v)
     )
+    result = x.copy()
+    result[: 2 * q] += 0.1 * across[:, None, :]
+    result[2 * q :] += 0.1 * down[:, :, None]
+    return result
 
 
 def resized(x, height, width):
     """Bilinear, corners on corners."""
-    down, across = linear(x.shape[1], height), linear(x.shape[2], width)
-    return np.einsum("ri,kj,cij->crk", down, across, x, optimize=True)
-
-
-def linear(size, wanted):
-    place = np.arange(wanted) * ((size - 1) / (wanted - 1))
-    return np.maximum(1.0 - np.abs(place[:, None] - np.arange(size)), 0.0)
+    maps, size = torch.from_numpy(x)[None], (height, width)
+    return functional.interpolate(maps, size, mode="bilinear", align_corners=True)[0].numpy()
 
 
 def cubic(size, wanted):

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from igsr.capture import Camera, Points, View
+from igsr.capture import Points
 from igsr.capture.types import Tracks
 
 
-def projected(camera: Camera, xyz: np.ndarray) -> np.ndarray:
+def projected(camera, xyz):
     """[P, 2] pixels, by the camera matrix."""
     homogeneous = (xyz @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]) @ camera.K.T
     return homogeneous[:, :2] / homogeneous[:, 2:]
 
 
-def tracked(
-    views: Sequence[View], xyz: np.ndarray, noise: float = 0.0, miss: float = 0.0, seed: int = 0
-) -> Points:
+def tracked(views, xyz, noise=0.0, miss=0.0, seed=0):
     """Points that each view sees, to ``noise`` pixels, but for a part of ``miss`` at random."""
     random = np.random.default_rng(seed)
     view, point, xy = [], [], []

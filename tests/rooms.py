@@ -23,7 +23,7 @@ WALLS = (
 TEXELS = 24.0
 
 
-def camera(angle: float, focal: float = 200.0, width: int = 240, height: int = 180) -> Camera:
+def camera(angle, focal=200.0, width=240, height=180):
     """A camera on an arc about the room's middle, looking at it; angle in radians."""
     middle = np.array([0.0, 0.0, 3.0])
     center = middle + 4.0 * np.array(
@@ -39,7 +39,7 @@ def camera(angle: float, focal: float = 200.0, width: int = 240, height: int = 1
     return Camera(viewmat, intrinsic_matrix(focal, focal, width / 2, height / 2), width, height)
 
 
-def picture(camera: Camera, seed: int = 0, k: float = 0.0) -> np.ndarray:
+def picture(camera, seed=0, k=0.0):
     """uint8 [H, W, 3]: the room of a seed as a camera sees it, four rays a pixel.
 
     Its lens puts a ray at radius r (1 + k r^2).
@@ -72,12 +72,12 @@ def picture(camera: Camera, seed: int = 0, k: float = 0.0) -> np.ndarray:
     return np.rint(colors.reshape(height, 2, width, 2, 3).mean(axis=(1, 3))).astype(np.uint8)
 
 
-def photos(cameras: list[Camera], seed: int = 0, k: float = 0.0) -> list[Photo]:
+def photos(cameras, seed=0, k=0.0):
     """Photos of the room, named 0.png and so on."""
     return [Photo(f"{i}.png", picture(camera, seed, k)) for i, camera in enumerate(cameras)]
 
 
-def depths(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+def depths(camera, pixels):
     """float64 [P]: z-depths of the room at pixels [P, 2] of a camera."""
     slopes = (pixels - camera.K[[0, 1], 2]) / camera.K[[0, 1], [0, 1]]
     rays = np.pad(slopes, ((0, 0), (0, 1)), constant_values=1.0) @ camera.viewmat[:3, :3]
@@ -89,7 +89,7 @@ def depths(camera: Camera, pixels: np.ndarray) -> np.ndarray:
     return nearest
 
 
-def depth(camera: Camera) -> np.ndarray:
+def depth(camera):
     """float32 [H, W]: z-depths of the room at all pixel centers of a camera."""
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     pixels = np.stack([x.ravel(), y.ravel()], axis=1)

@@ -17,11 +17,6 @@ INTRINSICS = np.stack(
 )
 
 
-def max_degrees(one, other):
-    products = np.einsum("sij,sij->s", one[:, :, :3], other[:, :3, :3])
-    return np.degrees(np.arccos(np.clip((products - 1.0) / 2.0, -1.0, 1.0))).max()
-
-
 def test_decoding_inverts_encoding():
     encoding = encode_pose(VIEWMATS, INTRINSICS, SIZES * 5)
     assert (encoding[:, 6] >= 0).all()

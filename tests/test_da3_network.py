@@ -7,11 +7,11 @@ import pytest
 import torch
 from da3_networks import TINY, hashed_network, hashed_pixels
 from da3_slow import SlowDa3
+from scenes import ring_camera
 
 from igsr.cameras.da3.backbone import BASE, SMALL, reference_view
 from igsr.cameras.da3.cameras import encode_pose, normalized_viewmats
 from igsr.cameras.da3.network import Da3Network
-from igsr.cameras.networks import rotary_tables, rotated
 
 FIELDS = ("depth", "confidence", "rays", "ray_confidence", "pose_encoding")
 #: The float32 network reached 2e-6 of the largest value; half precision is off by 1e-3.
@@ -52,11 +52,7 @@ def test_views_may_differ_in_size(network, slow):
 
 def test_known_cameras_as_in_the_slow_network(network, slow):
     pixels = hashed_pixels("cameras", 3, 42, 70)
-    viewmats = np.tile(np.eye(4), (3, 1, 1))
-    for n in (1, 2):
-        cos, sin = np.cos(0.3 * n), np.sin(0.3 * n)
-        viewmats[n, :3, :3] = [[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]]
-        viewmats[n, :3, 3] = [0.5 * n, -0.2, 3.0]
+    viewmats = np.stack([ring_camera(0.3 * n).viewmat for n in range(3)])
     intrinsics = np.tile(np.diag([80.0, 75.0, 1.0]), (3, 1, 1))
     found = network.predict(
         list(pixels), viewmats=torch.from_numpy(viewmats), intrinsics=torch.from_numpy(intrinsics)
@@ -118,16 +114,6 @@ def test_published_sizes_have_their_number_of_parameters():
         with torch.device("meta"):
             network = Da3Network(config)
         assert sum(value.numel() for value in network.parameters()) == count
-
-
-def test_rotary_products_depend_on_the_difference_of_positions():
-    places = torch.tensor([[2, 5], [4, 1], [12, 9], [14, 5]])
-    q, k = torch.randn(2, 1, 1, 16, generator=torch.Generator().manual_seed(0)).double()
-    cosine, sine = rotary_tables(places, 16)
-    turned = [rotated(x.expand(1, 4, 16), (cosine, sine)) for x in (q, k)]
-    products = (turned[0] @ turned[1].mT)[0]
-    assert products[0, 1] == pytest.approx(float(products[2, 3]), rel=1e-5)
-    assert products[0, 1] != pytest.approx(float(products[0, 2]), rel=1e-2)
 
 
 def test_the_reference_view_is_the_most_average_one():

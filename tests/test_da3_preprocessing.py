@@ -7,16 +7,8 @@ import pytest
 import torch
 from torch.nn.functional import interpolate
 
-from igsr.cameras.da3.prediction import (
-    DEVIATION,
-    MEAN,
-    area_matrix,
-    cubic_matrix,
-    network_input,
-    resampled,
-    resampling_of,
-    resamplings_of,
-)
+from igsr.cameras.da3 import prediction
+from igsr.cameras.da3.prediction import network_input, resampled, resampling_of, resamplings_of
 from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
 
@@ -26,17 +18,17 @@ def test_area_means(size, wanted):
     # A fine comb of samples: the same number in each input pixel, and in each output pixel.
     values = np.random.default_rng(size).random(size)
     samples = np.repeat(values, wanted)
-    np.testing.assert_allclose(
-        area_matrix(size, wanted) @ values, samples.reshape(wanted, size).mean(axis=1), atol=1e-12
-    )
+    means = prediction.area_matrix(size, wanted) @ values
+    np.testing.assert_allclose(means, samples.reshape(wanted, size).mean(axis=1), atol=1e-12)
 
 
 @pytest.mark.parametrize(("size", "wanted"), [(5, 14), (30, 42), (42, 30), (9, 9)])
 def test_cubic_convolution_is_that_of_torch(size, wanted):
     values = np.random.default_rng(size).random((size, 3))
     image = torch.from_numpy(values.T.reshape(1, 3, size, 1)).expand(-1, -1, -1, 4)
-    wanted_values = interpolate(image, size=(wanted, 4), mode="bicubic")[0, :, :, 1].numpy().T
-    np.testing.assert_allclose(cubic_matrix(size, wanted) @ values, wanted_values, atol=1e-9)
+    found = prediction.cubic_matrix(size, wanted) @ values
+    expected = interpolate(image, size=(wanted, 4), mode="bicubic")[0, :, :, 1].numpy().T
+    np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
 # By the published code's rules; 7 above a multiple of 14 is rounded up.
@@ -81,7 +73,7 @@ def test_channels_are_normalized():
     pixels = network_input(image, resampling_of(28, 28, 28))
     assert pixels.dtype == np.float32
     assert pixels.shape == (3, 28, 28)
-    wanted = (np.array([10, 100, 200]) / 255 - MEAN) / DEVIATION
+    wanted = (np.array([10, 100, 200]) / 255 - prediction.MEAN) / prediction.DEVIATION
     np.testing.assert_allclose(pixels[:, 5, 7], wanted, atol=1e-6)
 
 

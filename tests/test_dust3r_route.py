@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -67,6 +68,17 @@ class Scene:
                 progress("pairs", done + 1, len(pairs))
         return [GRID] * len(photos), predictions
 
+    def changed(self, change):
+        """The predictor with a function that changes each prediction in place."""
+
+        def predictor(photos, pairs, progress=None):
+            grids, predictions = self.predictor(photos, pairs)
+            for prediction in predictions:
+                change(prediction)
+            return grids, predictions
+
+        return predictor
+
 
 @pytest.fixture(scope="module")
 def scene():
@@ -114,9 +126,8 @@ def test_photos_in_fit_and_scores_out(tmp_path, monkeypatch, igsr_here):
 
 
 def test_points_lie_on_the_scene_with_its_colors(scene, estimate):
-    world = similarity_between(estimate.cameras, scene.cameras)
     points = estimate.points
-    xyz = world.scale * points.xyz @ world.rotation.T + world.translation
+    xyz = similarity_between(estimate.cameras, scene.cameras).apply(points.xyz.T).T
     truth = np.concatenate([w[s] for w, s in zip(scene.worlds, scene.seen, strict=True)])
     nearest = np.linalg.norm(xyz[:, None] - truth[None], axis=2)
     assert nearest.min(axis=1).max() < 1e-2
@@ -188,15 +199,13 @@ def test_known_cameras_are_kept_and_define_intrinsics(scene):
 def test_focal_lengths_per_device(scene):
     zoomed = [Photo(p.name, p.image, None, None, "12"[i > 1]) for i, p in enumerate(scene.photos)]
 
-    def predictor(photos, pairs, progress=None):
+    def enlarge(prediction):
         """Depths 10 % too large for two photos, as for another focal length."""
-        grids, predictions = scene.predictor(photos, pairs)
-        for prediction in predictions:
-            if prediction.first > 1:
-                prediction.first_points[..., 2] *= 1.1
-                prediction.second_points[..., 2] *= 1.1
-        return grids, predictions
+        if prediction.first > 1:
+            prediction.first_points[..., 2] *= 1.1
+            prediction.second_points[..., 2] *= 1.1
 
+    predictor = scene.changed(enlarge)
     cameras = Dust3r(predictor)(zoomed).cameras
     focals = [camera.K[0, 0] for camera in cameras]
     assert len(set(focals[:2])) == len(set(focals[2:])) == 1
@@ -238,15 +247,14 @@ def test_dense_depths_keep_the_edges_of_the_pointmap(scene):
 def test_a_predictor_that_keeps_dense_maps_gives_dense_depths(scene):
     def predictor(photos, pairs, progress=None):
         grids, predictions = scene.predictor(photos, pairs)
+        whole = Grid(2 * GRID.height, 2 * GRID.width, 1.0, 1.0, 4.0, 2.0)
+        samples = range(0, whole.height, 2), range(0, whole.width, 2)
         dense = []
-        for i in range(len(photos)):
+        for i, grid in enumerate(grids):
             kept = next(p for p in predictions if p.first == i)
-            depth = np.repeat(np.repeat(kept.first_points[..., 2], 2, axis=0), 2, axis=1)
-            sure = np.repeat(np.repeat(kept.first_confidence, 2, axis=0), 2, axis=1)
-            whole = Grid(2 * GRID.height, 2 * GRID.width, 1.0, 1.0, 4.0, 2.0)
-            rows, columns = range(0, depth.shape[0], 2), range(0, depth.shape[1], 2)
-            map_of = DenseMap(depth, sure, whole, rows, columns)
-            dense.append(DenseGrid(**vars(grids[i]), dense=map_of))
+            maps = (kept.first_points[..., 2], kept.first_confidence)
+            maps = [np.kron(one, np.ones((2, 2), np.float32)) for one in maps]
+            dense.append(DenseGrid(**vars(grid), dense=DenseMap(*maps, whole, *samples)))
         return dense, predictions
 
     found = Dust3r(predictor)(scene.photos)
@@ -269,14 +277,11 @@ def test_the_network_fits_into_the_route(scene):
 
 
 def test_photos_of_another_thing_are_named(scene):
-    def predictor(photos, pairs, progress=None):
-        grids, predictions = scene.predictor(photos, pairs)
-        strangers = {3}
-        for prediction in predictions:
-            if (prediction.first in strangers) != (prediction.second in strangers):
-                prediction.first_confidence[:] = prediction.second_confidence[:] = 1.1
-        return grids, predictions
+    def doubt(prediction):
+        if 3 in (prediction.first, prediction.second):
+            prediction.first_confidence[:] = prediction.second_confidence[:] = 1.1
 
+    predictor = scene.changed(doubt)
     found = Dust3r(predictor)(scene.photos)
     assert found.cameras[3] is found.depths[3] is found.trusted[3] is None
     assert [("3.png" in sentence) for sentence in found.warnings] == [True]
@@ -288,23 +293,18 @@ def test_photos_of_another_thing_are_named(scene):
 
 
 def test_invalid_input(scene):
-    def useless(photos, pairs, progress=None):
-        grids, predictions = scene.predictor(photos, pairs)
-        for prediction in predictions:
-            prediction.first_confidence[:] = prediction.second_confidence[:] = 1.0
-        return grids, predictions
+    def doubt(prediction):
+        prediction.first_confidence[:] = prediction.second_confidence[:] = 1.0
 
-    with pytest.raises(IgsrError, match="no overlap between any two photos"):
-        Dust3r(useless)(scene.photos[:2])
-    with pytest.raises(IgsrError, match="at least two photos"):
-        Dust3r(scene.predictor)(scene.photos[:1])
-    with pytest.raises(IgsrError, match="pair graph 'star' is unknown"):
-        Dust3r(scene.predictor, graph="star")(scene.photos)
-    with pytest.raises(IgsrError, match=r"cameras names '9.png', which is none of the photos"):
-        Dust3r(scene.predictor, cameras={"9.png": scene.cameras[0]})(scene.photos)
     camera = scene.cameras[0]
-    small = Camera(camera.viewmat, camera.K, 24, 48)
-    with pytest.raises(IgsrError, match="of 24 x 48 pixels, and the photo has 48 x 48"):
-        Dust3r(scene.predictor, cameras={"0.png": small})(scene.photos)
-    with pytest.raises(IgsrError, match="nowhere"):
-        Dust3r(checkpoint="/nowhere/at_all.pth")(scene.photos)
+    small = replace(camera, width=24)
+    for options, count, message in (
+        ({"predictor": scene.changed(doubt)}, 2, "no overlap between any two photos"),
+        ({}, 1, "at least two photos"),
+        ({"graph": "star"}, 4, "pair graph 'star' is unknown"),
+        ({"cameras": {"9.png": camera}}, 4, "cameras names '9.png', which is none of the photos"),
+        ({"cameras": {"0.png": small}}, 4, "of 24 x 48 pixels, and the photo has 48 x 48"),
+        ({"predictor": None, "checkpoint": "/nowhere/at_all.pth"}, 4, "nowhere"),
+    ):
+        with pytest.raises(IgsrError, match=message):
+            Dust3r(**{"predictor": scene.predictor, **options})(scene.photos[:count])

@@ -11,11 +11,11 @@ from igsr.cameras.colmap.guided_matching import EpipolarLine, Plane, comparable,
 H = np.array([[0.9, 0.1, 20.0], [-0.1, 1.0, 5.0], [1e-4, 0.0, 1.0]])
 
 
-def homogeneous(xy: np.ndarray) -> np.ndarray:
+def homogeneous(xy):
     return np.hstack([xy, np.ones((len(xy), 1))])
 
 
-def two_photos(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def two_photos(seed=0):
     """Places and descriptors of two photos of 300 points, and their fundamental matrix.
 
     Ten textures repeat everywhere, so that descriptors alone are ambiguous.
@@ -42,12 +42,12 @@ def two_photos(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nd
     return places[0], a, places[1][order], b[order], F
 
 
-def one_by_one(xy, a, other_xy, b, allowed) -> set[tuple[int, int]]:
+def one_by_one(xy, a, other_xy, b, allowed):
     """The definition: each other's nearest by less than 0.8 of the next, if allowed."""
     distance = np.linalg.norm(a[:, None].astype(float) - b[None].astype(float), axis=2)
     distance[~allowed] = np.inf
 
-    def clear(rows: np.ndarray) -> np.ndarray:
+    def clear(rows):
         nearest, second = np.sort(rows, axis=1)[:, :2].T
         chosen = (nearest < 0.8 * second) & (nearest <= 0.7 * 512.0)
         return np.where(chosen, rows.argmin(axis=1), -1)
@@ -57,7 +57,7 @@ def one_by_one(xy, a, other_xy, b, allowed) -> set[tuple[int, int]]:
 
 
 @pytest.mark.parametrize("rows", [7, 512])
-def test_matches_follow_the_definition(rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_matches_follow_the_definition(rows, monkeypatch):
     monkeypatch.setattr(guided_matching, "BATCH_FEATURES", rows)
     xy, a, other_xy, b, F = two_photos()
     # Features whose nearest one has a better partner.
@@ -77,7 +77,7 @@ def test_matches_follow_the_definition(rows: int, monkeypatch: pytest.MonkeyPatc
     assert len(expected) > 100 > 10 * len(everywhere)
 
 
-def test_a_plane_guides_matching() -> None:
+def test_a_plane_guides_matching():
     """Distances are in the second photo, also for matches from the second to the first."""
     xy, a, _, _, _ = two_photos(1)
     mapped = homogeneous(xy) @ H.T
@@ -92,7 +92,7 @@ def test_a_plane_guides_matching() -> None:
     assert 150 < len(expected) < 290
 
 
-def test_distances_are_exact_for_any_descriptors() -> None:
+def test_distances_are_exact_for_any_descriptors():
     random = np.random.default_rng(3)
     a, b = (random.integers(0, 256, (50, 128)).astype(np.uint8) for _ in range(2))
     a[0], b[0] = 255, 0  # the longest possible distance
@@ -101,7 +101,7 @@ def test_distances_are_exact_for_any_descriptors() -> None:
     np.testing.assert_array_equal(-product.astype(np.int64), exact)
 
 
-def test_no_features_no_matches() -> None:
+def test_no_features_no_matches():
     xy, a, _, _, F = two_photos()
     nothing = comparable(np.zeros((0, 2)), np.zeros((0, 128), dtype=np.uint8))
     some = comparable(xy, a)

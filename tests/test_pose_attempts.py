@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -29,125 +27,97 @@ from igsr.geometry.pose_errors import pose_accuracy
 CAMERAS = [rooms.camera(angle) for angle in np.linspace(-0.4, 0.4, 5)]
 
 
-def silent(*arguments: object) -> None:
+def silent(*arguments):
     pass
 
 
 class Model:
     """Stands in for COLMAP's model."""
 
-    def __init__(self, *placed: int) -> None:
+    def __init__(self, *placed):
         self.placed = set(placed)
 
-    def num_reg_images(self) -> int:
+    def num_reg_images(self):
         return len(self.placed)
 
-    def reg_image_ids(self) -> list[int]:
+    def reg_image_ids(self):
         return [image_id(index) for index in self.placed]
 
 
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Any, Any, list[Any]]]:
-    """Run ``mapped`` on eight photos with made-up models; returns its calls, too."""
-
-    def with_models(
-        models: dict[int, Model | None],
-        further: dict[int, set[int]],
-        more: bool = True,
-        with_any: set[int] | None = None,
-    ) -> tuple[Any, Any, list[Any]]:
-        calls: list[Any] = []
-
-        def make(count: int, database: Path, evidence: Any, *_: object) -> Model | None:
-            step = THRESHOLDS.index(evidence)
-            calls.append(("map", step, database.name))
-            return models.get(step)
-
-        def add(model: Model, count: int, database: Path, evidence: Any, *_: object) -> None:
-            step = THRESHOLDS.index(evidence)
-            calls.append(("extend", step, database.name))
-            model.placed |= further.get(step, set())
-
-        def look(matches: Path, missing: set[int], show: object) -> Path | None:
-            calls.append(("guided", sorted(missing)))
-            return Path("guided.db") if more else None
-
-        monkeypatch.setattr(attempts, "with_focal_lengths", lambda path, seed: path)
-        some = sorted(with_any or range(8))
-        found = {(image_id(some[0]), image_id(other)): np.zeros((9, 2)) for other in some[1:]}
-        monkeypatch.setattr(attempts, "links", lambda path: found)
-        monkeypatch.setattr(attempts, "contradictions", lambda model, matches, usable: set())
-        monkeypatch.setattr(attempts, "matched_along_lines", look)
-        monkeypatch.setattr(attempts, "map_photos", make)
-        monkeypatch.setattr(attempts, "extend", add)
-        result = mapped(8, Path("matched.db"), 0, silent)
-        assert result.removed_pairs == 0
-        return result.model, result.doubtful, calls
-
-    return with_models
+RETRIES = [
+    *("map 0 matched", "extend 1 matched", "guided 67", "extend 2 guided"),
+    *("guided 01234567", "map 3 guided", "map 4 guided"),
+]
 
 
-def test_a_complete_model_is_kept(run: Callable[..., Any]) -> None:
-    model, doubtful, calls = run({0: Model(*range(8))}, {})
-    assert calls == [("map", 0, "matched.db")]
-    assert model.num_reg_images() == 8
-    assert not doubtful
+@pytest.mark.parametrize(
+    ("models", "further", "options", "expected", "placed", "doubtful"),
+    [
+        # A complete model is kept.
+        ({0: 8}, {}, {}, RETRIES[:1], 8, False),
+        # A model without few photos is extended.
+        ({0: 6}, {1: {6}, 2: {7}}, {}, [*RETRIES[:2], "guided 7", RETRIES[3]], 8, False),
+        # With lower thresholds all photos are mapped again; with more evidence a model is kept.
+        ({0: 6, 3: 7}, {2: {6}}, {}, RETRIES, 7, False),
+        ({0: 6, 4: 8}, {}, {}, RETRIES, 8, True),
+        # A model without many photos is replaced; later ones too, even if they lack few photos.
+        (
+            {0: 2, 1: 6, 2: 7, 3: 8},
+            {},
+            {},
+            ["map 0 matched", "map 1 matched", "guided 01234567", "map 2 guided", "map 3 guided"],
+            8,
+            True,
+        ),
+        # Photos without matches are not tried again.
+        ({0: 4}, {}, {"linked": 4}, RETRIES[:1], 4, False),
+        # The same matches are not mapped twice.
+        (
+            {0: 4},
+            {},
+            {"more": False},
+            [f"map {n} matched" if n != 2 else "guided 01234567" for n in range(5)],
+            4,
+            False,
+        ),
+    ],
+)
+def test_attempts_of_eight_photos(
+    monkeypatch, models, further, options, expected, placed, doubtful
+):
+    calls = []
+
+    def make(count, database, evidence, *_):
+        step = THRESHOLDS.index(evidence)
+        calls.append(f"map {step} {database.stem}")
+        return Model(*range(models[step])) if step in models else None
+
+    def add(model, count, database, evidence, *_):
+        step = THRESHOLDS.index(evidence)
+        calls.append(f"extend {step} {database.stem}")
+        model.placed |= further.get(step, set())
+
+    def look(matches, missing, show):
+        calls.append("guided " + "".join(map(str, sorted(missing))))
+        return Path("guided.db") if options.get("more", True) else None
+
+    found = {
+        (image_id(0), image_id(other)): np.zeros((9, 2))
+        for other in range(1, options.get("linked", 8))
+    }
+    monkeypatch.setattr(attempts, "with_focal_lengths", lambda path, seed: path)
+    monkeypatch.setattr(attempts, "links", lambda path: found)
+    monkeypatch.setattr(attempts, "contradictions", lambda model, matches, usable: set())
+    monkeypatch.setattr(attempts, "matched_along_lines", look)
+    monkeypatch.setattr(attempts, "map_photos", make)
+    monkeypatch.setattr(attempts, "extend", add)
+    result = mapped(8, Path("matched.db"), 0, silent)
+    assert calls == expected
+    assert result.model.placed == set(range(placed))
+    assert (result.doubtful, result.removed_pairs) == (doubtful, 0)
 
 
-def test_a_model_without_few_photos_is_extended(run: Callable[..., Any]) -> None:
-    model, doubtful, calls = run({0: Model(0, 1, 2, 3, 4, 5)}, {1: {6}, 2: {7}})
-    assert calls == [
-        ("map", 0, "matched.db"),
-        ("extend", 1, "matched.db"),
-        ("guided", [7]),
-        ("extend", 2, "guided.db"),
-    ]
-    assert model.num_reg_images() == 8
-    assert not doubtful
-
-
-def test_with_lower_thresholds_all_photos_are_mapped_again(run: Callable[..., Any]) -> None:
-    model, doubtful, calls = run({0: Model(*range(6)), 3: Model(*range(7))}, {2: {6}})
-    assert calls[3:] == [
-        ("extend", 2, "guided.db"),
-        ("guided", list(range(8))),
-        ("map", 3, "guided.db"),
-        ("map", 4, "guided.db"),
-    ]
-    assert model.placed == set(range(7))
-    assert not doubtful  # the one with more evidence is kept
-    model, doubtful, _ = run({0: Model(*range(6)), 4: Model(*range(8))}, {})
-    assert model.num_reg_images() == 8
-    assert doubtful
-
-
-def test_a_model_without_many_photos_is_replaced(run: Callable[..., Any]) -> None:
-    # Later models are replaced, too, even if they lack few photos.
-    found = {0: Model(0, 1), 1: Model(*range(6)), 2: Model(*range(7)), 3: Model(*range(8))}
-    model, doubtful, calls = run(found, {})
-    assert calls == [
-        ("map", 0, "matched.db"),
-        ("map", 1, "matched.db"),
-        ("guided", list(range(8))),
-        ("map", 2, "guided.db"),
-        ("map", 3, "guided.db"),
-    ]
-    assert model is found[3]
-    assert doubtful
-
-
-def test_photos_without_matches_are_not_tried_again(run: Callable[..., Any]) -> None:
-    model, _, calls = run({0: Model(0, 1, 2, 3)}, {}, with_any={0, 1, 2, 3})
-    assert calls == [("map", 0, "matched.db")]
-    assert model.num_reg_images() == 4
-
-
-def test_the_same_matches_are_not_mapped_twice(run: Callable[..., Any]) -> None:
-    _, _, calls = run({0: Model(0, 1, 2, 3)}, {}, more=False)
-    assert [call[1] for call in calls if call[0] == "map"] == [0, 1, 3, 4]
-
-
-def test_a_photo_is_added_to_a_model_of_the_others(tmp_path: Path) -> None:
+def test_a_photo_is_added_to_a_model_of_the_others(tmp_path):
     import pycolmap
 
     photos = rooms.photos(CAMERAS)
@@ -165,15 +135,8 @@ def test_a_photo_is_added_to_a_model_of_the_others(tmp_path: Path) -> None:
         assert with_matches(fewer) == set(range(4))
         model = map_photos(5, with_focal_lengths(fewer, 0), THRESHOLDS[0], 0, silent)
         assert model.num_reg_images() == 4
-        progress: list[tuple[int, int]] = []
-        extend(
-            model,
-            5,
-            database,
-            THRESHOLDS[0],
-            0,
-            lambda stage, done, of: progress.append((done, of)),
-        )
+        progress, shown = [], []
+        extend(model, 5, database, THRESHOLDS[0], 0, lambda *step: progress.append(step[1:]))
     assert progress == [(4, 5), (5, 5)]
     found = estimate_of(photos, Mapped(model, doubtful=False, removed_pairs=0))
     accuracy = pose_accuracy(found.cameras, CAMERAS)
@@ -183,8 +146,7 @@ def test_a_photo_is_added_to_a_model_of_the_others(tmp_path: Path) -> None:
     assert found.warnings == []
 
     # With known geometry more features match; pairs without a missing photo keep their matches.
-    shown: list[tuple[int, int]] = []
-    more = matched_along_lines(database, [4], lambda stage, done, of: shown.append((done, of)))
+    more = matched_along_lines(database, [4], lambda *step: shown.append(step[1:]))
     before, after = inliers(database), inliers(more)
     assert before.keys() == after.keys()
     with_missing = {pair for pair in after if image_id(4) in pair}
@@ -194,7 +156,7 @@ def test_a_photo_is_added_to_a_model_of_the_others(tmp_path: Path) -> None:
     assert matched_along_lines(database, [], silent) is None
 
 
-def inliers(database: Path) -> dict[tuple[int, int], int]:
+def inliers(database):
     """Number of matches of each pair."""
     import pycolmap
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
@@ -23,7 +22,7 @@ from igsr.cameras.colmap.attempts import Mapped
 from igsr.cameras.colmap.database import list_photos
 from igsr.cameras.colmap.features import find_features
 from igsr.cameras.estimate import Estimate
-from igsr.capture import Camera, Capture, View
+from igsr.capture import Capture, View
 from igsr.capture.photo_folder import Photo
 from igsr.capture.write_transforms import write_transforms
 from igsr.geometry.pose_errors import pose_accuracy
@@ -33,20 +32,20 @@ CAMERAS = [rooms.camera(angle) for angle in np.linspace(-0.5, 0.5, 6)]
 
 
 @pytest.fixture(scope="module")
-def photos() -> list[Photo]:
+def photos():
     return rooms.photos(CAMERAS)
 
 
 @pytest.fixture(scope="module")
-def found(photos: list[Photo]) -> Estimate:
+def found(photos):
     return Colmap()(photos, seed=3)
 
 
-def matrices(cameras: list[Camera | None]) -> list[object]:
+def matrices(cameras):
     return [None if c is None else (c.viewmat.tolist(), c.K.tolist()) for c in cameras]
 
 
-def test_cameras_points_and_tracks_are_right(found: Estimate) -> None:
+def test_cameras_points_and_tracks_are_right(found):
     accuracy = pose_accuracy(found.cameras, CAMERAS)
     assert accuracy["registered"] == 6
     assert accuracy["RRA@5"] == accuracy["RTA@5"] == 1.0
@@ -80,12 +79,10 @@ def test_cameras_points_and_tracks_are_right(found: Estimate) -> None:
     assert np.median(off) < 1.0
 
 
-def test_the_same_seed_gives_the_same_bits_without_output(
-    photos: list[Photo], found: Estimate, capfd: pytest.CaptureFixture[str]
-) -> None:
-    stages: dict[str, list[tuple[int, int]]] = {}
+def test_the_same_seed_gives_the_same_bits_without_output(photos, found, capfd):
+    stages = {}
 
-    def progress(stage: str, done: int, total: int) -> None:
+    def progress(stage, done, total):
         stages.setdefault(stage, []).append((done, total))
 
     again = Colmap()(photos, seed=3, progress=progress)
@@ -98,7 +95,7 @@ def test_the_same_seed_gives_the_same_bits_without_output(
     assert capfd.readouterr() == ("", "")
 
 
-def test_several_processes_find_the_same_features(photos, found, monkeypatch) -> None:
+def test_several_processes_find_the_same_features(photos, found, monkeypatch):
     monkeypatch.setattr(features, "MIN_PARALLEL_PX", 0)
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     again = Colmap()(photos, seed=3)
@@ -109,7 +106,7 @@ def test_several_processes_find_the_same_features(photos, found, monkeypatch) ->
         Colmap()(photos, seed=3)
 
 
-def test_lens_distortion_is_estimated_and_undone() -> None:
+def test_lens_distortion_is_estimated_and_undone():
     bent = rooms.photos(CAMERAS[1:5], k=-0.12)
     capture = igsr.find_cameras(bent, "colmap")
     assert pose_accuracy([v.camera for v in capture.views], CAMERAS[1:5])["RTA@5"] == 1.0
@@ -121,7 +118,7 @@ def test_lens_distortion_is_estimated_and_undone() -> None:
         assert off < 0.5 * np.abs(rooms.picture(true, k=-0.12) - straight)[inner].mean()
 
 
-def test_masked_pixels_have_no_influence_on_photos_of_two_cameras() -> None:
+def test_masked_pixels_have_no_influence_on_photos_of_two_cameras():
     cameras, photos = [], []
     for index, angle in enumerate(np.linspace(-0.5, 0.5, 7)):
         wide = index % 2 == 0
@@ -144,14 +141,14 @@ def test_masked_pixels_have_no_influence_on_photos_of_two_cameras() -> None:
         assert camera.K[0, 0] == pytest.approx(true.K[0, 0], rel=0.03)
 
 
-def test_two_photos_with_a_focal_length_from_exif() -> None:
+def test_two_photos_with_a_focal_length_from_exif():
     photos = [replace(p, focal=200.0) for p in rooms.photos(CAMERAS[2:4])]
     found = Colmap()(photos)
     assert pose_accuracy(found.cameras, CAMERAS[2:4])["mAA@30"] > 0.95
     assert found.cameras[0].K[0, 0] == 200.0
 
 
-def test_photos_of_another_scene_are_named_and_the_others_placed(photos: list[Photo]) -> None:
+def test_photos_of_another_scene_are_named_and_the_others_placed(photos):
     stranger = replace(rooms.photos([CAMERAS[2]], seed=7)[0], name="garden/other.png")
     with pytest.warns(UserWarning, match=r"4 of 5 photos .* garden/other\.png\.$"):
         capture = igsr.find_cameras([*photos[1:3], stranger, *photos[3:5]], "colmap")
@@ -169,7 +166,7 @@ def test_photos_of_another_scene_are_named_and_the_others_placed(photos: list[Ph
         igsr.find_cameras(photos[1:2], "colmap")
 
 
-def test_few_pairs_of_many_photos_are_matched(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_few_pairs_of_many_photos_are_matched(monkeypatch):
     """200 photos of a walk whose end shows its beginning again."""
     random = np.random.default_rng(0)
     places = random.normal(size=(200, 10, 128)).astype(np.float32)
@@ -188,7 +185,7 @@ def test_few_pairs_of_many_photos_are_matched(monkeypatch: pytest.MonkeyPatch) -
     assert max(photos_of_tiles) <= 2 * pairs.TILE_PHOTOS
 
 
-def test_a_warning_says_how_long_many_photos_take(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_warning_says_how_long_many_photos_take(monkeypatch):
     for step in ("list_photos", "find_features"):
         monkeypatch.setattr(estimator, step, lambda *arguments: None)
     monkeypatch.setattr(estimator, "matched", lambda *arguments: None)
@@ -201,7 +198,7 @@ def test_a_warning_says_how_long_many_photos_take(monkeypatch: pytest.MonkeyPatc
         igsr.find_cameras(tiny, "colmap")
 
 
-def test_similar_photos_are_found_by_their_features(photos: list[Photo], tmp_path: Path):
+def test_similar_photos_are_found_by_their_features(photos, tmp_path):
     stranger = rooms.photos([CAMERAS[2]], seed=7)
     both = [*photos[:3], *stranger]
     database = tmp_path / "database.db"
@@ -222,7 +219,7 @@ class Known:
 
     calls: ClassVar[list[tuple[str, int]]] = []
 
-    def __init__(self, name: str, placed: Sequence[int], world: Similarity | None = None) -> None:
+    def __init__(self, name, placed, world=None):
         self.name, self.placed, self.world = name, placed, world
 
     def __call__(self, photos, *, seed=0, progress=None):
@@ -237,10 +234,10 @@ class Known:
 
 
 @pytest.fixture
-def registered(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+def registered(monkeypatch):
     """Replace the estimators by others of the same names; those not given are not ready."""
 
-    def replace_by(**estimators: Known) -> None:
+    def replace_by(**estimators):
         Known.calls.clear()
         for name in registry.ESTIMATORS:
             known = estimators.get(name)
@@ -254,7 +251,7 @@ TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 OTHER_WORLD = Similarity(2.5, TURN, np.array([1.0, -2.0, 3.0]))
 
 
-def test_auto_asks_no_network_if_colmap_places_all(photos, registered) -> None:
+def test_auto_asks_no_network_if_colmap_places_all(photos, registered):
     registered(colmap=Known("colmap", range(6)), da3=Known("da3", range(6)))
     with pytest.warns(UserWarning, match=r"^A warning by colmap\.$"):
         capture = igsr.find_cameras(photos, seed=4)
@@ -263,9 +260,7 @@ def test_auto_asks_no_network_if_colmap_places_all(photos, registered) -> None:
     np.testing.assert_array_equal(capture.views[1].image, photos[1].image)
 
 
-def test_auto_adds_a_networks_cameras_for_photos_that_colmap_cannot_place(
-    photos, registered
-) -> None:
+def test_auto_adds_a_networks_cameras_for_photos_that_colmap_cannot_place(photos, registered):
     network = Known("dust3r", range(6), OTHER_WORLD)
     registered(colmap=Known("colmap", [0, 1, 2, 4]), dust3r=network)
     with pytest.warns(UserWarning, match=r"Cameras of 3\.png, 5\.png are those that dust3r"):
@@ -281,7 +276,7 @@ def test_auto_adds_a_networks_cameras_for_photos_that_colmap_cannot_place(
             assert view.pose_evidence.rests_on == "network"
 
 
-def test_auto_without_weights_keeps_what_colmap_placed(photos, registered) -> None:
+def test_auto_without_weights_keeps_what_colmap_placed(photos, registered):
     registered(colmap=Known("colmap", [0, 1, 3]))
     with pytest.warns(UserWarning, match="A warning by colmap"):
         capture = igsr.find_cameras(photos)
@@ -289,7 +284,7 @@ def test_auto_without_weights_keeps_what_colmap_placed(photos, registered) -> No
     assert Known.calls == [("colmap", 0)]
 
 
-def test_auto_takes_the_network_alone_if_colmap_places_too_few(photos, registered) -> None:
+def test_auto_takes_the_network_alone_if_colmap_places_too_few(photos, registered):
     registered(colmap=Known("colmap", [0, 1]), da3=Known("da3", range(6), OTHER_WORLD))
     with pytest.warns(UserWarning, match="A warning by da3"):
         capture = igsr.find_cameras(photos)
@@ -298,7 +293,7 @@ def test_auto_takes_the_network_alone_if_colmap_places_too_few(photos, registere
     )
 
 
-def test_auto_imports_no_torch_if_colmap_places_all(tmp_path: Path) -> None:
+def test_auto_imports_no_torch_if_colmap_places_all(tmp_path):
     for photo in rooms.photos(CAMERAS[1:5]):
         Image.fromarray(photo.image).save(tmp_path / photo.name)
     code = (
@@ -311,7 +306,7 @@ def test_auto_imports_no_torch_if_colmap_places_all(tmp_path: Path) -> None:
     assert done.stdout == "4 False\n"
 
 
-def test_auto_uses_the_cameras_of_a_capture(photos, registered, tmp_path: Path) -> None:
+def test_auto_uses_the_cameras_of_a_capture(photos, registered, tmp_path):
     registered(colmap=Known("colmap", range(6)))
     views = [View(f"{i}.png", CAMERAS[i], "train", photos[i].image) for i in range(2)]
     write_transforms(Capture(tmp_path, views), tmp_path / "given")
@@ -331,12 +326,12 @@ def test_auto_uses_the_cameras_of_a_capture(photos, registered, tmp_path: Path) 
         ("auto", {"seed": -1}, "seed is -1"),
     ],
 )
-def test_wrong_arguments_are_errors(photos, estimator, options, message) -> None:
+def test_wrong_arguments_are_errors(photos, estimator, options, message):
     with pytest.raises(igsr.IgsrError, match=message):
         igsr.find_cameras(photos[:3], estimator, **options)
 
 
-def test_a_list_has_files_or_photos_of_different_names(photos: list[Photo], tmp_path: Path) -> None:
+def test_a_list_has_files_or_photos_of_different_names(photos, tmp_path):
     Image.fromarray(photos[0].image).save(tmp_path / "a.png")
     with pytest.raises(igsr.IgsrError, match="mixes files and Photo objects"):
         igsr.find_cameras([tmp_path / "a.png", photos[1]])
@@ -346,7 +341,7 @@ def test_a_list_has_files_or_photos_of_different_names(photos: list[Photo], tmp_
         igsr.find_cameras([tmp_path / "a.png"])
 
 
-def test_accuracy_of_known_errors() -> None:
+def test_accuracy_of_known_errors():
     """Three cameras, one turned by 10.5 degrees: two of three pairs are off by that."""
     angle = np.radians(10.5)
     turn = np.eye(4)

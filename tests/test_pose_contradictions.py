@@ -5,9 +5,9 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
+import pycolmap
 import pytest
 import rooms
 
@@ -25,38 +25,29 @@ from igsr.cameras.colmap.features import find_features
 from igsr.cameras.colmap.mapping import map_photos
 from igsr.cameras.colmap.matching import matched, with_focal_lengths
 from igsr.cameras.colmap.result import estimate_of
-from igsr.capture.photo_folder import Photo
 from igsr.geometry.pose_errors import pose_accuracy
 
 
 class Image:
     """A photo of a model that looks along +z, with pycolmap's interface."""
 
-    def __init__(self, center: tuple[float, float, float], sees: list[int]) -> None:
+    def __init__(self, center, sees):
         self.center = np.array(center)
-        self.camera = SimpleNamespace(
-            mean_focal_length=lambda: 100.0,
-            focal_length_x=100.0,
-            focal_length_y=100.0,
-            principal_point_x=100.0,
-            principal_point_y=100.0,
-            width=200,
-            height=200,
-        )
+        self.camera = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 100.0, 200, 200)
         self.points2D = [
             SimpleNamespace(point3D_id=point, has_point3D=lambda point=point: point >= 0)
             for point in sees
         ]
 
-    def projection_center(self) -> np.ndarray:
+    def projection_center(self):
         return self.center
 
-    def cam_from_world(self) -> Any:
+    def cam_from_world(self):
         pose = np.hstack([np.eye(3), -self.center[:, None]])
         return SimpleNamespace(matrix=lambda: pose)
 
 
-def model_of(*images: Image, frames: int = 0) -> Any:
+def model_of(*images, frames=0):
     """A model of photos 1, 2 ... of 400 points on a wall at z = 4, 20 of them in its middle."""
     random = np.random.default_rng(0)
     xyz = np.c_[random.uniform(-2.0, 2.0, (400, 2)), np.full(400, 4.0)]
@@ -73,17 +64,17 @@ def model_of(*images: Image, frames: int = 0) -> Any:
 HALF, OTHER = list(range(200)), list(range(180, 380))
 
 
-def test_neighboring_photos_must_share_points() -> None:
+def test_neighboring_photos_must_share_points():
     together = Image((0.0, 0.0, 0.0), HALF), Image((0.3, 0.0, 0.0), OTHER)
     assert contradictions(model_of(*together), {}, {}) == {(1, 2)}
-    sharing = Image((0.3, 0.0, 0.0), list(range(150, 380)))
-    assert contradictions(model_of(together[0], sharing), {}, {}) == set()
-    # Photos of other light share few points, but not in one place.
-    few = Image((0.3, 0.0, 0.0), [*range(0, 180, 9), *range(200, 380)])
-    assert contradictions(model_of(together[0], few), {}, {}) == set()
-    # Photos that were never compared share no points; rigs are not checked.
-    strange = Image((0.3, 0.0, 0.0), list(range(200, 380)))
-    assert contradictions(model_of(together[0], strange), {}, {}) == set()
+    for sees in (
+        range(150, 380),
+        [*range(0, 180, 9), *range(200, 380)],  # few points as in other light, but not in one place
+        range(200, 380),  # no points, as in photos that were never compared
+    ):
+        other = Image((0.3, 0.0, 0.0), sees)
+        assert contradictions(model_of(together[0], other), {}, {}) == set()
+    # Rigs are not checked.
     assert contradictions(model_of(*together, frames=1), {}, {}) == set()
     # Matches count also without points.
     matches = {(1, 2): np.stack([np.arange(50), np.arange(50)], axis=1).astype(np.uint32)}
@@ -103,19 +94,13 @@ def test_neighboring_photos_must_share_points() -> None:
         ((0.3, 0.0, 0.0), []),
     ],
 )
-def test_other_photos_need_not_share_points(
-    center: tuple[float, float, float], sees: list[int]
-) -> None:
-    few = HALF[:90]
-    assert (
-        contradictions(model_of(Image((0.0, 0.0, 0.0), few), Image(center, sees)), {}, {}) == set()
-    )
-    if sees:
-        whole = Image((0.0, 0.0, 0.0), HALF), Image(center, sees)
-        assert contradictions(model_of(*whole), {}, {}) == set()
+def test_other_photos_need_not_share_points(center, sees):
+    for seen in (HALF[:90], HALF) if sees else (HALF[:90],):
+        model = model_of(Image((0.0, 0.0, 0.0), seen), Image(center, sees))
+        assert contradictions(model, {}, {}) == set()
 
 
-def test_the_weakest_links_are_left_out() -> None:
+def test_the_weakest_links_are_left_out():
     #   1 = 2 = 3 - 4 = 5, and 6 hangs on 5 alone
     strengths = {(1, 2): 500, (2, 3): 400, (3, 4): 40, (4, 5): 600, (1, 5): 30, (5, 6): 20}
     assert links_between_parts(strengths, set()) == set()
@@ -125,24 +110,22 @@ def test_the_weakest_links_are_left_out() -> None:
     assert links_between_parts({**strengths, (3, 4): 200}, {(2, 5)}) == set()
 
 
-def show(*progress: object) -> None:
+def show(*progress):
     pass
 
 
-def matches_of(photos: list[Photo], folder: Path) -> Path:
+def matches_of(photos, folder):
     features = folder / "features.db"
     list_photos(photos, features)
     find_features(photos, features, show)
     return matched(len(photos), features, 0, show)
 
 
-def test_two_rooms_that_look_alike_are_kept_apart(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_two_rooms_that_look_alike_are_kept_apart(tmp_path, monkeypatch):
     # A part of the walls of room 0 is also in room 1.
     original = rooms.texture
 
-    def texture(seed: int) -> np.ndarray:
+    def texture(seed):
         walls = original(seed)
         if seed >= 10:
             walls[:64, :64] = original(seed - 10)[:64, :64]
@@ -170,9 +153,7 @@ def test_two_rooms_that_look_alike_are_kept_apart(
     assert "look alike" in estimate.warnings[1]
 
 
-def test_photos_of_another_season_stay_in_one_model(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_photos_of_another_season_stay_in_one_model(tmp_path, monkeypatch):
     # They share few points with the others, but not in one place.
     cameras = [rooms.camera(angle) for angle in np.linspace(-0.4, 0.4, 6)]
     photos = rooms.photos(cameras[::2])
