@@ -1,7 +1,5 @@
 """Models, cameras and comparisons that the tests of scene pages share."""
 
-from __future__ import annotations
-
 import base64
 import json
 

@@ -1,7 +1,5 @@
 """The announcement of a run, and its estimate of the time."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

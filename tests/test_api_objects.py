@@ -1,7 +1,5 @@
 """Representation, notebook pictures and equality of the API's objects."""
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import io

@@ -1,7 +1,5 @@
 """Fits in blocks: one scene, with the same bits if parts of the run are lost and repeated."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

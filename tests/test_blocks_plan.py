@@ -1,7 +1,5 @@
 """The plan of a fit in blocks: cells, their photos, and what photos show of them."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import struct

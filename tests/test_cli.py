@@ -1,7 +1,5 @@
 """The ``igsr`` command as users run it: files, exit codes, error messages of one sentence."""
 
-from __future__ import annotations
-
 import json
 import os
 import resource

@@ -1,7 +1,5 @@
 """``igsr pose``, ``igsr convert`` of captures, and ``igsr fit`` of photos without cameras."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """``igsr refine``."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

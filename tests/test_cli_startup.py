@@ -1,7 +1,5 @@
 """Start of the command: imported modules, help texts, and the options before the command."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os

@@ -1,7 +1,5 @@
 """``igsr view`` with a display: starts splat-view with cameras that it can read."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import json
 import os

@@ -1,7 +1,5 @@
 """Calls of the Rust module: each wrong argument is refused by name, and nothing panics."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """``igsr.fit`` with a folder, and ``igsr fit``, which writes the same files."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,7 +1,5 @@
 """GPUs that fail: "auto" warns and uses the CPU; a fit ends with one message and its checkpoint."""
 
-from __future__ import annotations
-
 import re
 import warnings
 

@@ -1,7 +1,5 @@
 """Levels of detail: fewer splats that look alike from afar, in cells that viewers load."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

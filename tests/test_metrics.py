@@ -1,7 +1,5 @@
 """Metrics against independent computations, with masks and small pictures."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

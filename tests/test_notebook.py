@@ -1,7 +1,5 @@
 """Notebooks that are run as Jupyter runs them: the viewer that a cell returns opens."""
 
-from __future__ import annotations
-
 import nbformat
 import pytest
 from nbclient import NotebookClient

@@ -1,7 +1,5 @@
 """Work over Ray: what is said where Ray, a cluster or a machine cannot be used."""
 
-from __future__ import annotations
-
 import socket
 import sys
 

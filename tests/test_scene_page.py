@@ -1,7 +1,5 @@
 """``scene.html`` in a real browser: pictures as the renderer's, mouse, touch and keys."""
 
-from __future__ import annotations
-
 import base64
 import re
 import time

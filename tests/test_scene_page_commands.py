@@ -1,7 +1,5 @@
 """``scene.html``, as ``igsr convert`` and ``igsr fit`` write it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scenes

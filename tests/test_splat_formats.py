@@ -1,7 +1,5 @@
 """Splat files in every format, from Python: agreement with decoders in numpy, and ``convert``."""
 
-from __future__ import annotations
-
 import json
 import os
 import warnings
@@ -27,7 +25,7 @@ def unit(quats):
     return quats * np.where(quats[:, :1] < 0, -1.0, 1.0)
 
 
-def assert_agrees(path: Path) -> int:
+def assert_agrees(path):
     """Our reader and numpy's find the same splats in a file; how many."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -1,7 +1,5 @@
 """Splats: shapes are checked, files come back as they went, damage is refused."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os

@@ -1,7 +1,5 @@
 """The page of ``igsr view --web`` in a browser: follows a run and compares models."""
 
-from __future__ import annotations
-
 import json
 import time
 

@@ -1,7 +1,5 @@
 """The server of ``igsr view --web``: access, models and photos, bad requests, the command."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """igsr without torch: what works, and what says which extra it lacks."""
 
-from __future__ import annotations
-
 import json
 import sys
 

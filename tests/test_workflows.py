@@ -1,7 +1,5 @@
 """The recipes of wheels stand in the form that hosting sites run, and name what is there."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """The server of ``igsr view --web`` for tests, and requests to it."""
 
-from __future__ import annotations
-
 import contextlib
 import http.client
 import json
