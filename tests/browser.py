@@ -25,13 +25,6 @@ FLAGS = (
 )
 
 
-def browser_program():
-    """The name of the browser that is here."""
-    program = next((name for name in NAMES if shutil.which(name)), None)
-    assert program, "no browser to open the page with: install chromium, as make test does"
-    return program
-
-
 class Browser:
     """One page of a browser.
 
@@ -41,7 +34,8 @@ class Browser:
     """
 
     def __init__(self, profile, size=(640, 480)):
-        program = browser_program()
+        program = next((name for name in NAMES if shutil.which(name)), None)
+        assert program, "no browser to open the page with: install chromium, as make test does"
         to_browser, self._write = os.pipe()
         self._read, from_browser = os.pipe()
         command = [program, *FLAGS, f"--user-data-dir={profile}"]
@@ -68,13 +62,8 @@ class Browser:
         self._session = attached["sessionId"]
         for domain in ("Page", "Runtime", "Log", "Network"):
             self._ask(f"{domain}.enable")
-        self._ask(
-            "Emulation.setDeviceMetricsOverride",
-            width=size[0],
-            height=size[1],
-            deviceScaleFactor=1,
-            mobile=False,
-        )
+        lens = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": False}
+        self._ask("Emulation.setDeviceMetricsOverride", **lens)
 
     def __enter__(self):
         return self
@@ -114,13 +103,8 @@ class Browser:
 
     def run(self, expression, timeout=60.0):
         """The value of JavaScript; a promise is waited for."""
-        answer = self._ask(
-            "Runtime.evaluate",
-            timeout,
-            expression=expression,
-            awaitPromise=True,
-            returnByValue=True,
-        )
+        options = {"expression": expression, "awaitPromise": True, "returnByValue": True}
+        answer = self._ask("Runtime.evaluate", timeout, **options)
         assert "exceptionDetails" not in answer, answer["exceptionDetails"]
         return answer["result"].get("value")
 

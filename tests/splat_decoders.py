@@ -11,11 +11,9 @@ import struct
 import zipfile
 
 import numpy as np
-import numpy.typing as npt
 from PIL import Image
 
 C0 = 0.28209479177387814
-Decoded = dict[str, npt.NDArray[np.float64]]
 
 #: Formats with y up and z back instead of down and forward.
 Y_UP = ("spz", "glb", "gltf")
@@ -120,18 +118,11 @@ def splat(content):
 
 def ksplat(content):
     """Of compression level 0 and one section only."""
-    assert content[0] == 0
-    assert content[1] == 1
-    assert content[20] == 0
-    sections = struct.unpack_from("<I", content, 4)[0]
     count, _, _, buckets = struct.unpack_from("<4I", content, 4096)
-    stored, degree = (
-        struct.unpack_from("<H", content, 4096 + 20)[0],
-        struct.unpack_from("<H", content, 4096 + 40)[0],
-    )
-    partial = struct.unpack_from("<I", content, 4096 + 36)[0]
-    assert sections == 1
-    assert degree == 0
+    (sections,), (partial,) = (struct.unpack_from("<I", content, at) for at in (4, 4096 + 36))
+    (stored,), (degree,) = (struct.unpack_from("<H", content, 4096 + at) for at in (20, 40))
+    assert (content[0], content[1], content[20]) == (0, 1, 0)
+    assert (sections, degree) == (1, 0)
     floats = ("mean", "<f4", 3), ("scale", "<f4", 3), ("quat", "<f4", 4), ("rgba", "u1", 4)
     start = 4096 + 1024 + 4 * partial + stored * buckets
     table = np.frombuffer(content, np.dtype(list(floats)), count, start)
