@@ -179,7 +179,7 @@ def test_track_depths_are_those_of_the_points_that_photos_see(town):
         assert depths_of(capture.views, points) is None
 
 
-# The first is a small scene, of which the coarse fit has all splats.
+# The coarse fit of a small scene has all of its splats.
 @pytest.mark.parametrize(
     ("blocks", "splats", "size"),
     [(2, 50_000, 333), (2, 9_000_000, 333), (60, 9_000_000, 141)],

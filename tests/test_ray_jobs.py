@@ -1,4 +1,4 @@
-"""Work over Ray: what is said where Ray, a cluster or a machine cannot be used."""
+"""Work over Ray: messages if Ray, a cluster or a machine cannot be used."""
 
 import socket
 import sys
@@ -28,7 +28,7 @@ def test_ray_that_is_missing_or_of_another_version_is_named(ray, monkeypatch):
 
 
 def test_a_cluster_that_cannot_be_joined_is_named(ray):
-    # Nobody answers there: Ray is not asked.
+    # No head answers at this address, so Ray is not asked.
     with pytest.raises(igsr.IgsrError, match=r"Ray cluster at 127\.0\.0\.1:9: .*refused"):
         RayCluster("127.0.0.1:9").__enter__()
     assert ray.addresses == []

@@ -1,4 +1,4 @@
-"""igsr without torch: what works, and what says which extra it lacks."""
+"""igsr without torch: commands that work, and messages that name the missing extra."""
 
 import json
 

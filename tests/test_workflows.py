@@ -1,4 +1,4 @@
-"""The recipes of wheels stand in the form that hosting sites run, and name what is there."""
+"""The recipes of wheels stand in the form that hosting sites run, and name existing things."""
 
 import re
 import shutil
@@ -13,7 +13,7 @@ WORKFLOW = ROOT / ".github" / "workflows" / "wheels.yml"
 
 
 def checked(path):
-    """What check-jsonschema says of a workflow; its schema comes with the package."""
+    """The result of check-jsonschema for a workflow; its schema comes with the package."""
     program = Path(sys.executable).with_name("check-jsonschema")
     command = [str(program), "--builtin-schema", "vendor.github-workflows", str(path)]
     return subprocess.run(command, capture_output=True, text=True, timeout=60)
