@@ -1,7 +1,5 @@
 """A headless browser that tests steer: the DevTools protocol over a pipe, without a library."""
 
-from __future__ import annotations
-
 import base64
 import contextlib
 import json
@@ -11,7 +9,6 @@ import shutil
 import subprocess
 import time
 from pathlib import Path
-from typing import Any
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 #: WebGL without a GPU.
@@ -28,13 +25,6 @@ FLAGS = (
 )
 
 
-def browser_program() -> str:
-    """The name of the browser that is here."""
-    program = next((name for name in NAMES if shutil.which(name)), None)
-    assert program, "no browser to open the page with: install chromium, as make test does"
-    return program
-
-
 class Browser:
     """One page of a browser.
 
@@ -43,8 +33,9 @@ class Browser:
         requests: addresses that the page asked for.
     """
 
-    def __init__(self, profile: Path, size: tuple[int, int] = (640, 480)) -> None:
-        program = browser_program()
+    def __init__(self, profile, size=(640, 480)):
+        program = next((name for name in NAMES if shutil.which(name)), None)
+        assert program, "no browser to open the page with: install chromium, as make test does"
         to_browser, self._write = os.pipe()
         self._read, from_browser = os.pipe()
         command = [program, *FLAGS, f"--user-data-dir={profile}"]
@@ -61,9 +52,9 @@ class Browser:
         os.close(from_browser)
         self._number = 0
         self._buffer = b""
-        self._session: str | None = None
-        self.problems: list[str] = []
-        self.requests: list[str] = []
+        self._session = None
+        self.problems = []
+        self.requests = []
         self._loaded = False
         found = self._ask("Target.getTargets")["targetInfos"]
         target = next(one["targetId"] for one in found if one["type"] == "page")
@@ -71,18 +62,13 @@ class Browser:
         self._session = attached["sessionId"]
         for domain in ("Page", "Runtime", "Log", "Network"):
             self._ask(f"{domain}.enable")
-        self._ask(
-            "Emulation.setDeviceMetricsOverride",
-            width=size[0],
-            height=size[1],
-            deviceScaleFactor=1,
-            mobile=False,
-        )
+        lens = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": False}
+        self._ask("Emulation.setDeviceMetricsOverride", **lens)
 
-    def __enter__(self) -> Browser:
+    def __enter__(self):
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *_):
         with contextlib.suppress(OSError):
             os.close(self._write)
         os.close(self._read)
@@ -93,68 +79,63 @@ class Browser:
             self._process.kill()
             self._process.wait()
 
-    def open(self, page: Path | str, timeout: float = 60.0) -> None:
+    def open(self, page, timeout=60.0):
         """Open a file or an address, and wait until its script has started or failed."""
         self.load(page, timeout)
         self.run("window.igsr.ready.then(() => true)", timeout)
 
-    def leave(self) -> None:
+    def leave(self):
         """Leave the page: one that asks a server would go on with it."""
         self._load("about:blank", 60.0)
 
-    def load(self, page: Path | str, timeout: float = 60.0) -> None:
+    def load(self, page, timeout=60.0):
         """Open a file or an address, of any page, and wait until it has loaded."""
         self.problems.clear()
         self.requests.clear()
         self._load(page.as_uri() if isinstance(page, Path) else page, timeout)
 
-    def _load(self, address: str, timeout: float) -> None:
+    def _load(self, address, timeout):
         self._loaded = False
         self._ask("Page.navigate", url=address)
         end = time.monotonic() + timeout
         while not self._loaded:
             self._receive(end)
 
-    def run(self, expression: str, timeout: float = 60.0) -> Any:
+    def run(self, expression, timeout=60.0):
         """The value of JavaScript; a promise is waited for."""
-        answer = self._ask(
-            "Runtime.evaluate",
-            timeout,
-            expression=expression,
-            awaitPromise=True,
-            returnByValue=True,
-        )
+        options = {"expression": expression, "awaitPromise": True, "returnByValue": True}
+        answer = self._ask("Runtime.evaluate", timeout, **options)
         assert "exceptionDetails" not in answer, answer["exceptionDetails"]
         return answer["result"].get("value")
 
-    def mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
+    def mouse(self, kind, x, y, **more):
         """A mouse event, such as "mousePressed"."""
         self._ask("Input.dispatchMouseEvent", type=kind, x=x, y=y, **more)
 
-    def drag(self, start: tuple[float, float], end: tuple[float, float], button: str) -> None:
+    def drag(self, start, end, button):
         """A drag with the "left" or "right" mouse button."""
         buttons = {"left": 1, "right": 2}[button]
         self.mouse("mousePressed", *start, button=button, buttons=buttons, clickCount=1)
         self.mouse("mouseMoved", *end, button=button, buttons=buttons)
         self.mouse("mouseReleased", *end, button=button)
 
-    def touch(self, kind: str, points: list[tuple[float, float]]) -> None:
+    def touch(self, kind, points):
         """A touch event, such as "touchStart", with the fingers that are down."""
         fingers = [{"x": x, "y": y, "id": k} for k, (x, y) in enumerate(points)]
         self._ask("Input.dispatchTouchEvent", type=kind, touchPoints=fingers)
 
-    def key(self, key: str, code: str, kind: str = "keyDown") -> None:
+    def key(self, key, code, kind="keyDown"):
         """A key goes down, or up with ``kind`` "keyUp"."""
         self._ask("Input.dispatchKeyEvent", type=kind, key=key, code=code)
 
-    def screenshot(self, path: Path) -> None:
+    def screenshot(self, path):
         """Save a screenshot of the page as PNG."""
         path.write_bytes(base64.b64decode(self._ask("Page.captureScreenshot")["data"]))
 
-    def _ask(self, method: str, timeout: float = 60.0, **parameters: Any) -> dict[str, Any]:
+    def _ask(self, method, timeout=60.0, **parameters):
         self._number += 1
         number = self._number
-        message: dict[str, Any] = {"id": number, "method": method, "params": parameters}
+        message = {"id": number, "method": method, "params": parameters}
         if self._session is not None:
             message["sessionId"] = self._session
         os.write(self._write, json.dumps(message).encode() + b"\0")
@@ -165,7 +146,7 @@ class Browser:
                 assert "error" not in answer, answer["error"]
                 return dict(answer["result"])
 
-    def _receive(self, end: float) -> dict[str, Any]:
+    def _receive(self, end):
         while b"\0" not in self._buffer:
             ready, _, _ = select.select([self._read], [], [], max(0.0, end - time.monotonic()))
             assert ready, "the browser does not answer"
@@ -173,11 +154,11 @@ class Browser:
             assert piece, "the browser has ended"
             self._buffer += piece
         text, self._buffer = self._buffer.split(b"\0", 1)
-        message: dict[str, Any] = json.loads(text)
+        message = json.loads(text)
         self._note(message.get("method"), message.get("params", {}))
         return message
 
-    def _note(self, method: str | None, said: dict[str, Any]) -> None:
+    def _note(self, method, said):
         if method == "Runtime.exceptionThrown":
             self.problems.append(str(said["exceptionDetails"]))
         elif method == "Runtime.consoleAPICalled" and said["type"] in ("error", "warning"):

@@ -1,7 +1,5 @@
 """A stand-in for the parts of Ray that igsr uses, in this process; test_blocks_ray.py uses Ray."""
 
-from __future__ import annotations
-
 import functools
 import sys
 import types
@@ -70,7 +68,7 @@ class StandInRay(types.ModuleType):
         pass
 
 
-def stand_in_ray(monkeypatch) -> StandInRay:
+def stand_in_ray(monkeypatch):
     """Replace the module ray."""
     ray = StandInRay()
     strategies = types.ModuleType("ray.util.scheduling_strategies")

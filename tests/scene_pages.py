@@ -1,7 +1,5 @@
 """Models, cameras and comparisons that the tests of scene pages share."""
 
-from __future__ import annotations
-
 import base64
 import json
 
@@ -16,6 +14,9 @@ from igsr.rendering.scene_page import PageCamera, write_scene_page
 #: Largest mean difference to the renderer's picture, in 255ths.
 MEAN = 1.0
 BACKGROUND = (0.2, 0.4, 0.6)
+#: Waits for the page in a frame, as in a notebook.
+WAIT = """<script>window.igsr = { ready: new Promise((resolve) => addEventListener("load", () =>
+    frames[0].igsr.ready.then(resolve))) }</script>"""
 PICTURE = """
 window.igsr.picture(%s, %s).then((pixels) => {
   let text = "";
@@ -40,16 +41,9 @@ def three_cameras(size=1.0, origin=(0.0, 0.0, 0.0)):
     """From above, below and the side, so that no basis function stays small."""
     middle = np.asarray(origin, dtype=float)
     K = np.array([[240.0, 0.0, 76.0], [0.0, 250.0, 83.0], [0.0, 0.0, 1.0]])
-    places = ((0.6, -1.9, -2.2), (2.1, 1.6, 1.4), (-2.8, -0.3, 0.9))
-    return [
-        igsr.Camera(
-            look_at(middle + size * np.array(place), middle, np.array([0.0, -1.0, 0.0])),
-            K,
-            160,
-            144,
-        )
-        for place in places
-    ]
+    places = size * np.array([(0.6, -1.9, -2.2), (2.1, 1.6, 1.4), (-2.8, -0.3, 0.9)])
+    viewmats = [look_at(middle + at, middle, np.array([0.0, -1.0, 0.0])) for at in places]
+    return [igsr.Camera(viewmat, K, 160, 144) for viewmat in viewmats]
 
 
 def named(cameras):
@@ -73,8 +67,13 @@ def drawn(browser, camera, timeout=60.0):
     return pixels.reshape(camera.height, camera.width, 4)[::-1, :, :3].astype(int)
 
 
-def check_pictures(browser, splats, cameras):
+def picture(splats, camera, background):
+    """The renderer's picture, int [H, W, 3]."""
+    return render(splats, camera, background, backend="cpu").to_uint8().astype(int)
+
+
+def check_pictures(browser, splats, cameras, background=BACKGROUND):
     for camera in cameras:
-        expected = render(splats, camera, BACKGROUND, backend="cpu").to_uint8().astype(int)
+        expected = picture(splats, camera, background)
         assert expected.std() > 20, "the scene is not in the picture"
         assert np.abs(drawn(browser, camera) - expected).mean() <= MEAN

@@ -4,21 +4,16 @@ Each decoder returns means, log-scales, quats wxyz, opacities in [0, 1], DC colo
 higher SH [N, K, 3], in the frame of the file.
 """
 
-from __future__ import annotations
-
 import gzip
 import io
 import json
 import struct
 import zipfile
-from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from PIL import Image
 
 C0 = 0.28209479177387814
-Decoded = dict[str, npt.NDArray[np.float64]]
 
 #: Formats with y up and z back instead of down and forward.
 Y_UP = ("spz", "glb", "gltf")
@@ -26,7 +21,7 @@ Y_UP = ("spz", "glb", "gltf")
 SH_SIGNS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float64)
 
 
-def decode(path: Path) -> Decoded:
+def decode(path):
     """The splats of a file, by its ending, turned to y down."""
     ending = "compressed" if path.name.endswith(".compressed.ply") else path.suffix[1:].lower()
     found = DECODERS[ending](path.read_bytes())
@@ -37,7 +32,7 @@ def decode(path: Path) -> Decoded:
     return found
 
 
-def largest_from_others(index: npt.NDArray[np.int64], others: npt.NDArray[np.float64]):
+def largest_from_others(index, others):
     """Quaternions whose component ``index`` is left out."""
     quats = np.zeros((len(index), 4))
     for which in range(4):
@@ -47,14 +42,14 @@ def largest_from_others(index: npt.NDArray[np.int64], others: npt.NDArray[np.flo
     return quats
 
 
-def ply(content: bytes) -> Decoded:
+def ply(content):
     head, body = content.split(b"end_header\n", 1)
     lines = head.decode().splitlines()
     count = next(int(line.split()[2]) for line in lines if line.startswith("element"))
     names = [line.split()[2] for line in lines if line.startswith("property float")]
     table = np.frombuffer(body, np.dtype([(name, "<f4") for name in names]), count)
 
-    def columns(prefix: str, number: int):
+    def columns(prefix, number):
         return np.stack([table[f"{prefix}{k}"] for k in range(number)], axis=1).astype(np.float64)
 
     rest = sum(name.startswith("f_rest_") for name in names)
@@ -69,7 +64,7 @@ def ply(content: bytes) -> Decoded:
     }
 
 
-def compressed(content: bytes) -> Decoded:
+def compressed(content):
     head, body = content.split(b"end_header\n", 1)
     counts, floats, rest = {}, 0, 0
     for line in head.decode().splitlines():
@@ -84,11 +79,11 @@ def compressed(content: bytes) -> Decoded:
     bounds = bounds.astype(np.float64)[np.arange(count) // 256]
     sh = np.frombuffer(body, np.uint8, count * rest, start + 16 * count).reshape(count, 3, -1)
 
-    def lerp(first: int, unit: npt.NDArray[np.float64]):
+    def lerp(first, unit):
         low, high = bounds[:, first : first + 3], bounds[:, first + 3 : first + 6]
         return low + (high - low) * unit
 
-    def three(column: int):
+    def three(column):
         bits = packed[:, column]
         parts = [(bits >> 21) / 2047, (bits >> 11 & 1023) / 1023, (bits & 2047) / 2047]
         return np.stack(parts, axis=1)
@@ -108,7 +103,7 @@ def compressed(content: bytes) -> Decoded:
     }
 
 
-def splat(content: bytes) -> Decoded:
+def splat(content):
     kind = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
     table = np.frombuffer(content, kind)
     return {
@@ -121,20 +116,13 @@ def splat(content: bytes) -> Decoded:
     }
 
 
-def ksplat(content: bytes) -> Decoded:
+def ksplat(content):
     """Of compression level 0 and one section only."""
-    assert content[0] == 0
-    assert content[1] == 1
-    assert content[20] == 0
-    sections = struct.unpack_from("<I", content, 4)[0]
     count, _, _, buckets = struct.unpack_from("<4I", content, 4096)
-    stored, degree = (
-        struct.unpack_from("<H", content, 4096 + 20)[0],
-        struct.unpack_from("<H", content, 4096 + 40)[0],
-    )
-    partial = struct.unpack_from("<I", content, 4096 + 36)[0]
-    assert sections == 1
-    assert degree == 0
+    (sections,), (partial,) = (struct.unpack_from("<I", content, at) for at in (4, 4096 + 36))
+    (stored,), (degree,) = (struct.unpack_from("<H", content, 4096 + at) for at in (20, 40))
+    assert (content[0], content[1], content[20]) == (0, 1, 0)
+    assert (sections, degree) == (1, 0)
     floats = ("mean", "<f4", 3), ("scale", "<f4", 3), ("quat", "<f4", 4), ("rgba", "u1", 4)
     start = 4096 + 1024 + 4 * partial + stored * buckets
     table = np.frombuffer(content, np.dtype(list(floats)), count, start)
@@ -148,7 +136,7 @@ def ksplat(content: bytes) -> Decoded:
     }
 
 
-def spz(content: bytes) -> Decoded:
+def spz(content):
     """Of versions 2 and 3: numpy brings no zstd for version 4."""
     content = gzip.decompress(content)
     magic, version, count, degree, fraction, _, _ = struct.unpack_from("<4sIIBBBB", content)
@@ -156,7 +144,7 @@ def spz(content: bytes) -> Decoded:
     assert version in (2, 3)
     start = 16
 
-    def take(width: int):
+    def take(width):
         nonlocal start
         rows = np.frombuffer(content, np.uint8, count * width, start).reshape(count, width)
         start += count * width
@@ -185,16 +173,16 @@ def spz(content: bytes) -> Decoded:
     }
 
 
-def sog(content: bytes) -> Decoded:
+def sog(content):
     archive = zipfile.ZipFile(io.BytesIO(content))
     meta = json.loads(archive.read("meta.json"))
     count = meta["count"]
 
-    def image(name: str):
+    def image(name):
         with Image.open(io.BytesIO(archive.read(name))) as picture:
             return np.asarray(picture.convert("RGBA")).astype(np.int64)
 
-    def pixels(part: str, which: int = 0):
+    def pixels(part, which=0):
         return image(meta[part]["files"][which]).reshape(-1, 4)[:count]
 
     low, high = np.array(meta["means"]["mins"]), np.array(meta["means"]["maxs"])
@@ -219,7 +207,7 @@ def sog(content: bytes) -> Decoded:
     }
 
 
-def glb(content: bytes) -> Decoded:
+def glb(content):
     """Of one primitive of floats, its node shifted at most."""
     magic, version, _, length, kind = struct.unpack_from("<4sII I4s", content)
     assert (magic, version, kind) == (b"glTF", 2, b"JSON")
@@ -227,7 +215,7 @@ def glb(content: bytes) -> Decoded:
     binary = content[28 + length :]
     attributes = document["meshes"][0]["primitives"][0]["attributes"]
 
-    def rows(name: str):
+    def rows(name):
         accessor = document["accessors"][attributes[name]]
         view = document["bufferViews"][accessor["bufferView"]]
         width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]

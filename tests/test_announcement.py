@@ -1,7 +1,5 @@
 """The announcement of a run, and its estimate of the time."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,16 +10,8 @@ from PIL import Image
 
 from igsr.cameras.colmap.estimator import camera_seconds
 from igsr.capture.load import Overview, look_at
-from igsr.fitting import announcement, settings_for
-from igsr.fitting.time_estimate import (
-    TYPICAL,
-    StepTime,
-    fit_seconds,
-    other_seconds,
-    slowdown,
-    timed_steps,
-    work_done,
-)
+from igsr.fitting import announcement, settings_for, time_estimate
+from igsr.fitting.time_estimate import TYPICAL, StepTime, fit_seconds, other_seconds, work_done
 
 #: A step that takes a microsecond per pixel.
 PER_PIXEL = StepTime(0.0, 1e-6, 0.0)
@@ -55,7 +45,7 @@ def test_progress_is_a_fraction_of_the_work():
 
 
 def test_steps_are_timed():
-    step = timed_steps("cpu")
+    step = time_estimate.timed_steps("cpu")
     assert step.per_pixel > 0.0
     assert step.per_splat >= 0.0
 
@@ -66,9 +56,9 @@ def test_time_of_depth_maps_and_scores():
     assert other_seconds(0, 10, 2e6) == pytest.approx(2.0 * other_seconds(0, 10, 1e6))
     # A machine with steps of half the time needs half the time for the rest.
     fast = StepTime(TYPICAL.fixed / 2.0, TYPICAL.per_pixel / 2.0, TYPICAL.per_splat / 2.0)
-    assert slowdown(TYPICAL, alpha=False) == 1.0
-    assert slowdown(fast, alpha=False) == pytest.approx(0.5)
-    assert slowdown(fast, alpha=True) > 0.5
+    assert time_estimate.slowdown(TYPICAL, alpha=False) == 1.0
+    assert time_estimate.slowdown(fast, alpha=False) == pytest.approx(0.5)
+    assert time_estimate.slowdown(fast, alpha=True) > 0.5
     assert other_seconds(8, 10, 1e6, 0.5) == pytest.approx(0.5 * other_seconds(8, 10, 1e6))
 
 

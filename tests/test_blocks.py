@@ -1,7 +1,5 @@
 """Fits in blocks: one scene, with the same bits if parts of the run are lost and repeated."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -52,10 +50,8 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def whole(folder, tmp_path_factory):
     """A run that is not interrupted."""
-    out = tmp_path_factory.mktemp("whole")
-    seen = []
-    splats, report = fit_in_blocks(folder, out, options(), seen.append)
-    return splats, report, out, seen
+    out, seen = tmp_path_factory.mktemp("whole"), []
+    return *fit_in_blocks(folder, out, options(), seen.append), out, seen
 
 
 def test_a_scene_in_blocks_is_one_scene(whole, folder):
@@ -210,23 +206,21 @@ def test_a_block_that_never_fits_is_named(folder, tmp_path, monkeypatch):
     assert (tmp_path / "blocks/block-000.json").is_file(), "the other block is kept"
 
 
-def test_a_full_disk_is_named(folder, tmp_path, monkeypatch):
+def test_changed_photos_and_full_disks_are_named(folder, tmp_path, monkeypatch):
+    def changed(run_task, task):
+        return run_task(replace(task, marks=["0" * 64] * len(task.marks)))
+
     def full(path, splats):
         save_splats(Path("/dev/full/splats.npz"), splats)
 
     monkeypatch.setattr(worker, "save_splats", full)
-    monkeypatch.setattr(runner, "in_a_process", lambda run_task, task: run_task(task))
-    with pytest.raises(igsr.IgsrError, match=r"^coarse on .*: Cannot write /dev/full"):
-        fit_in_blocks(folder, tmp_path, options())
-
-
-def test_a_photo_that_changes_during_the_run_is_named(folder, tmp_path, monkeypatch):
-    def changed(run_task, task):
-        return run_task(replace(task, marks=["0" * 64] * len(task.marks)))
-
-    monkeypatch.setattr(runner, "in_a_process", changed)
-    with pytest.raises(igsr.IgsrError, match=r"0001\.png was changed since the run began"):
-        fit_in_blocks(folder, tmp_path, options())
+    for work, message in (
+        (changed, r"0001\.png was changed since the run began"),
+        (lambda run_task, task: run_task(task), r"^coarse on .*: Cannot write /dev/full"),
+    ):
+        monkeypatch.setattr(runner, "in_a_process", work)
+        with pytest.raises(igsr.IgsrError, match=message):
+            fit_in_blocks(folder, tmp_path, options())
 
 
 def test_a_cell_without_photos_stays_coarse(folder, tmp_path, monkeypatch):
@@ -254,25 +248,19 @@ def test_a_capture_without_points_is_fitted(folder, tmp_path):
     assert all(block["fitted"] for block in report["blocks"])
 
 
-@pytest.mark.parametrize(
-    ("changed", "message"),
-    [
+def test_bad_options_and_photos_without_cameras_are_refused(folder, tmp_path, igsr_here):
+    for changed, message in (
         ({"blocks": 0}, "blocks must be auto or a number of at least 1, not 0"),
         ({"blocks": 99}, "99 blocks need at least as many photos to fit, not 13"),
         ({"settings": {"poses": "joint"}}, "leave poses out"),
         ({"holdout": 1}, "holdout is 1"),
-    ],
-)
-def test_bad_options_are_named(folder, tmp_path, changed, message):
-    with pytest.raises(igsr.IgsrError, match=message):
-        fit_in_blocks(folder, tmp_path, options(**changed))
-    assert not (tmp_path / "blocks").exists()
-
-
-def test_photos_without_cameras_are_refused(folder, tmp_path, igsr_here):
+    ):
+        with pytest.raises(igsr.IgsrError, match=message):
+            fit_in_blocks(folder, tmp_path / "out", options(**changed))
     shutil.copytree(folder / "images", tmp_path / "photos")
     with pytest.raises(igsr.IgsrError, match="no cameras"):
         fit_in_blocks(tmp_path / "photos", tmp_path / "out", options())
+    assert not (tmp_path / "out/blocks").exists()
     refused = igsr_here("fit", folder, "--out", tmp_path / "out", "--blocks", "two")
     assert refused.returncode == 1
     assert "--blocks must be auto or a whole number" in refused.stderr
@@ -296,29 +284,23 @@ def test_frozen_splats_do_not_change(halves, tmp_path):
     assert np.array_equal(means[-len(frozen) :], frozen.means)
     assert not np.array_equal(means[:5], start.means[:5])
     assert len(fitted) <= len(means) - len(frozen)
-    before, after = (
-        igsr.evaluate(splats, capture, "train").psnr for splats in (start, joined([fitted, frozen]))
-    )
-    assert after > before
+    before, after = (igsr.evaluate(s, capture, "train") for s in (start, joined([fitted, frozen])))
+    assert after.psnr > before.psnr
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (None, "frozen needs start"),
-        ({"sh": np.zeros((1, 1, 3), np.float32)}, "frozen has SH degree 0 and"),
+def test_bad_frozen_splats_are_named(halves):
+    capture, start, frozen = halves
+    given = {"steps": 5, "backend": "cpu", "frozen": frozen}
+    with pytest.raises(igsr.IgsrError, match="frozen needs start"):
+        scenes.fit(capture, **given)
+    for change, message in (
+        ({"sh": np.zeros((len(frozen), 1, 3), np.float32)}, "frozen has SH degree 0 and"),
         ({"origin": np.ones(3)}, "frozen and start have different origins"),
         ({"antialiased": True}, "frozen has antialiased splats"),
-    ],
-)
-def test_bad_frozen_splats_are_named(halves, change, message):
-    capture, start, frozen = halves
-    frozen = subset(frozen, slice(1))
-    given = {"frozen": frozen}
-    if change is not None:
-        given = {"start": start, "frozen": replace(frozen, **change)}
-    with pytest.raises(igsr.IgsrError, match=message):
-        scenes.fit(capture, steps=5, backend="cpu", **given)
+    ):
+        given["frozen"] = replace(frozen, **change)
+        with pytest.raises(igsr.IgsrError, match=message):
+            scenes.fit(capture, start=start, **given)
 
 
 def test_visible_seams_are_fitted_again(tmp_path, monkeypatch):

@@ -1,7 +1,5 @@
 """The plan of a fit in blocks: cells, their photos, and what photos show of them."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import struct
@@ -17,24 +15,13 @@ from scenes import round_splats
 
 import igsr
 from igsr._internal.peak_memory import peak_bytes
+from igsr.blocks import plan as block_plan
+from igsr.blocks import visibility
 from igsr.blocks.cells import Grid, grid_of, ground_axes, split_into_cells
 from igsr.blocks.crops import WHOLE, Box, box_around, cropped
 from igsr.blocks.manifest import Manifest, file_mark, read_manifest
-from igsr.blocks.plan import (
-    assign_photos,
-    blocks_for_memory,
-    memory_of,
-    photos_across_seams,
-    plan_blocks,
-)
+from igsr.blocks.plan import blocks_for_memory, memory_of, plan_blocks
 from igsr.blocks.tasks import BlockOptions, Context, Region, coarse_task
-from igsr.blocks.visibility import (
-    scene_depths,
-    splat_visibility,
-    track_depths,
-    track_visibility,
-    visible_boxes,
-)
 from igsr.capture import Camera, View
 from igsr.capture.photos import PhotoHeader, Shot
 from igsr.capture.types import intrinsic_matrix
@@ -113,7 +100,7 @@ def test_the_ground_is_level(spread, looks_down):
 def test_photos_are_assigned_to_the_blocks_that_they_show():
     visible = np.array([[0.9, 0.3], [0.3, 0.6], [0.01, 0.1], [0.08, 0.09], [0.0, 0.0]])
     is_near = np.array([[True, False]] * 4 + [[True, True]])
-    assert assign_photos(visible, is_near).tolist() == [
+    assert block_plan.assign_photos(visible, is_near).tolist() == [
         [True, True],
         [True, True],
         [False, True],  # the nearer block is hardly visible
@@ -121,7 +108,8 @@ def test_photos_are_assigned_to_the_blocks_that_they_show():
         [False, False],
     ]
     visible[0, 1] = 0.0
-    assert photos_across_seams(visible).tolist() == [False, True, False, False, False]
+    across = block_plan.photos_across_seams(visible)
+    assert across.tolist() == [False, True, False, False, False]
 
 
 def test_parts_of_photos_are_cropped():
@@ -160,22 +148,14 @@ def test_blocks_get_the_parts_of_photos_that_show_their_splats():
     splats = round_splats([[-1.0, 0.0, 4.0], [1.0, 0.5, 4.0]], size=0.15, opacity=6.0)
     inside, wanted = np.eye(2, dtype=np.bool_), np.array([[True, True], [False, True]])
     cameras = [camera([0.0, 0.0, 0.0])] * 2
-    first, second = visible_boxes(splats, cameras, inside, wanted, np.array([-1, 1]), "cpu")
+    given = (splats, cameras, inside, wanted, np.array([-1, 1]), "cpu")
+    first, second = visibility.visible_boxes(*given)
     assert (set(first), set(second)) == ({0, 1}, {1})
     assert first[0].right < 0.5 < first[1].left
     assert first[0].top == pytest.approx(1.0 - first[0].bottom, abs=0.05)
     assert first[1].top > 0.25
     # The block that a photo shows most of gets the pixels that show no splats, too.
     assert second[1] == WHOLE
-
-
-def test_parts_of_photos_take_less_memory(town):
-    _, folder = town
-    manifest = read_manifest(folder, None, None)
-    photos = manifest.of_split("train")
-    whole = memory_of(manifest, photos, None)
-    half = [Box(0.0, 0.0, 0.5, 1.0)] * len(photos)
-    assert memory_of(manifest, photos, None, boxes=half) < whole
 
 
 def test_overlap_of_photos_of_different_places():
@@ -189,25 +169,22 @@ def test_overlap_of_photos_of_different_places():
     assert photo_statistics(parts, np.full(100, 4.0)).overlap == pytest.approx(1.0)
 
 
-def test_track_depths_are_those_of_the_points_that_photos_see():
-    capture = towns.town(2, 1, 6, 32, 24, points=100, sharp=1)
-    depths = track_depths(capture.views, capture.points)
-    assert np.median(depths) == pytest.approx(3.5, rel=0.3)
+def test_track_depths_are_those_of_the_points_that_photos_see(town):
+    capture, _ = town
+    depths_of = visibility.track_depths
+    assert np.median(depths_of(capture.views, capture.points)) == pytest.approx(3.5, rel=0.3)
     unseen = [replace(capture.views[0], name="other.png")]
-    assert track_depths(unseen, capture.points) == [0.0]
-    assert track_depths(capture.views, replace(capture.points, tracks=None)) is None
-    assert track_depths(capture.views, None) is None
+    assert depths_of(unseen, capture.points) == [0.0]
+    for points in (None, replace(capture.points, tracks=None)):
+        assert depths_of(capture.views, points) is None
 
 
+# The coarse fit of a small scene has all of its splats.
 @pytest.mark.parametrize(
-    ("blocks", "splats", "size", "expected"),
-    [
-        (2, 50_000, 333, 50_000),  # all splats of a small scene
-        (2, 9_000_000, 333, None),
-        (60, 9_000_000, 141, None),
-    ],
+    ("blocks", "splats", "size"),
+    [(2, 50_000, 333), (2, 9_000_000, 333), (60, 9_000_000, 141)],
 )
-def test_a_coarse_fit_takes_no_more_memory_than_a_block(blocks, splats, size, expected):
+def test_a_coarse_fit_takes_no_more_memory_than_a_block(blocks, splats, size):
     header = PhotoHeader((1000, 750), 3)
     shots = [Shot("a", None, camera([0, 0, 0]), Lens(), "train", None, None)] * 3000
     manifest = Manifest(Path(), shots, [header] * 3000, [""] * 3000, lambda: None)
@@ -215,8 +192,8 @@ def test_a_coarse_fit_takes_no_more_memory_than_a_block(blocks, splats, size, ex
     task = coarse_task(Context(Path("out"), options, manifest), None, blocks)
     assert task.max_size == size
     assert task.settings["transients"] == "off"
-    if expected is not None:
-        assert task.settings["max_splats"] == expected
+    if splats == 50_000:
+        assert task.settings["max_splats"] == splats
         return
     photos = list(range(3000))
     coarse = memory_of(manifest, photos, size, task.settings["max_splats"])
@@ -249,7 +226,8 @@ def test_scene_depths_are_those_of_the_splats():
     image = np.zeros((24, 32, 3), np.uint8)
     facing = View("a.png", camera([0.0, 0.0, 0.0]), "train", image)
     away = View("b.png", camera([0.0, 0.0, 0.0], forward=(0.0, 0.0, -1.0)), "train", image)
-    assert scene_depths([facing, away], splats, "cpu") == pytest.approx([4.0, 0.0], abs=0.2)
+    found = visibility.scene_depths([facing, away], splats, "cpu")
+    assert found == pytest.approx([4.0, 0.0], abs=0.2)
 
 
 def test_hidden_splats_are_not_visible():
@@ -260,11 +238,11 @@ def test_hidden_splats_are_not_visible():
     cameras = [camera([0.0, 0.0, 0.0]), camera([0.0, 0.0, 9.0], forward=(0.0, 0.0, -1.0))]
     is_near = splats.means[:, 2] < 4.5
     groups = np.stack([is_near, ~is_near, np.ones(len(splats), np.bool_)], axis=1)
-    visibility = splat_visibility(splats, cameras, groups, "cpu")
-    assert visibility[0, 0] > 0.95
-    assert visibility[0, 1] < 0.05
-    assert visibility[1, 1] > 0.95
-    assert visibility[:, 2] == pytest.approx(1.0, abs=1e-3)
+    shares = visibility.splat_visibility(splats, cameras, groups, "cpu")
+    assert shares[0, 0] > 0.95
+    assert shares[0, 1] < 0.05
+    assert shares[1, 1] > 0.95
+    assert shares[:, 2] == pytest.approx(1.0, abs=1e-3)
 
 
 def test_track_visibility_is_that_of_the_points(town):
@@ -273,12 +251,12 @@ def test_track_visibility_is_that_of_the_points(town):
     centers = np.stack([view.camera.center for view in capture.views])
     names = [view.name for view in capture.views]
     groups = grid.inside(grid.positions(capture.points.xyz))
-    shares = track_visibility(capture.points, names, groups)
+    shares = visibility.track_visibility(capture.points, names, groups)
     own = grid.inside(grid.positions(centers))
     assert shares.sum(axis=1) == pytest.approx(1.0)
     assert shares[own].mean() > 0.6
     assert shares[~own].mean() < 0.4
-    assert track_visibility(None, names, groups).max() == 0.0
+    assert visibility.track_visibility(None, names, groups).max() == 0.0
 
 
 def test_a_manifest_decodes_nothing_and_marks_files(town, tmp_path, monkeypatch):
@@ -309,8 +287,11 @@ def test_a_mark_depends_on_the_size_and_both_ends(tmp_path):
         file_mark(tmp_path / "none")
 
 
-def test_less_memory_needs_more_blocks(town):
+def test_less_memory_needs_more_blocks_and_parts_of_photos_take_less(town):
     manifest = read_manifest(town[1], None, None)
+    photos = manifest.of_split("train")
+    half = [Box(0.0, 0.0, 0.5, 1.0)] * len(photos)
+    assert memory_of(manifest, photos, None, boxes=half) < memory_of(manifest, photos, None)
     assert blocks_for_memory(manifest, None, 1000, available=64 << 30) == 1
     assert blocks_for_memory(manifest, None, 1_000_000, available=2 << 30) > 1
     assert blocks_for_memory(manifest, None, 1_000_000, available=1) == 12

@@ -1,7 +1,5 @@
 """Blocks over a real Ray cluster of three nodes, one of which is killed during the fit."""
 
-from __future__ import annotations
-
 import json
 import threading
 import time

@@ -1,7 +1,5 @@
 """``igsr pose``, ``igsr convert`` of captures, and ``igsr fit`` of photos without cameras."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np
@@ -259,12 +257,9 @@ def test_arguments_are_checked_before_cameras_are_sought(
 ):
     out = ["--out", tmp_path / "out"]
     for path in (photos, given):
-        for options, message in (
-            (["--max-size", "0"], "max_size is 0"),
-            (["--max-size", "-5"], "max_size is -5"),
-            (["--holdout", "1"], "holdout is 1"),
-        ):
-            assert_fails(igsr_here(command, path, *out, *options), message)
+        for name, number in (("max-size", "0"), ("max-size", "-5"), ("holdout", "1")):
+            refused = igsr_here(command, path, *out, f"--{name}", number)
+            assert_fails(refused, f"{name.replace('-', '_')} is {number}")
         if command == "fit":
             hull = igsr_here("fit", path, *out, "--start", "hull", "--steps", "1")
             assert_fails(hull, "without alpha", "start hull")

@@ -1,7 +1,5 @@
 """``igsr refine``."""
 
-from __future__ import annotations
-
 import json
 
 import pytest
@@ -59,7 +57,6 @@ def test_settings_are_checked_before_cameras_are_sought(
     for name in registry.ESTIMATORS:
         monkeypatch.setitem(registry.ESTIMATORS, name, sought)
     bad = igsr_here("refine", photos, "--out", tmp_path / "out", *options)
-    assert bad.returncode == 1
-    assert bad.stderr == message + "\n"
+    assert (bad.returncode, bad.stderr) == (1, message + "\n")
     assert igsr_here("refine", photos, "--out", "out", "--backend", "reference").returncode == 2
     assert not (tmp_path / "out").exists()

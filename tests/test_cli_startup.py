@@ -1,7 +1,5 @@
 """Start of the command: imported modules, help texts, and the options before the command."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os
@@ -31,14 +29,15 @@ print("rooms", *sorted(name for name in sys.modules if name.startswith("igsr."))
 """
 
 
+def python(code, *arguments, **variables):
+    command = [sys.executable, "-c", code, *arguments]
+    environment = {**os.environ, **variables}
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+
+
 def imported(code, *arguments):
     """Top-level modules, and modules of igsr, that some code imports."""
-    done = subprocess.run(
-        [sys.executable, "-c", TRACED.format(code=code), *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    done = python(TRACED.format(code=code), *map(str, arguments))
     assert done.returncode == 0, done.stderr
     *_, modules, rooms = done.stdout.splitlines()
     return set(modules.split()[1:]), set(rooms.split()[1:])
@@ -55,12 +54,8 @@ def places(tmp_path_factory):
 def test_importing_igsr_imports_neither_numpy_nor_torch():
     modules, rooms = imported("import igsr")
     assert not modules & {*SLOW, "numpy", "rich", "typer", "PIL"}
-    assert rooms == {
-        "igsr._internal",
-        "igsr._internal.extras",
-        "igsr._internal.lazy_exports",
-        "igsr.errors",
-    }
+    inner = {f"igsr._internal{name}" for name in ("", ".extras", ".lazy_exports")}
+    assert rooms == {*inner, "igsr.errors"}
 
 
 @pytest.mark.parametrize(
@@ -179,16 +174,7 @@ def test_threads_are_checked(count, igsr_here, places):
     ],
 )
 def test_shells_complete_commands_and_options(words, expected):
-    done = subprocess.run(
-        [sys.executable, "-c", "from igsr.cli import app; app(prog_name='igsr')"],
-        env={
-            **os.environ,
-            "_IGSR_COMPLETE": "complete_bash",
-            "COMP_WORDS": words,
-            "COMP_CWORD": str(len(words.split(" ")) - 1),
-        },
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    variables = {"_IGSR_COMPLETE": "complete_bash", "COMP_WORDS": words}
+    variables["COMP_CWORD"] = str(len(words.split(" ")) - 1)
+    done = python("from igsr.cli import app; app(prog_name='igsr')", **variables)
     assert expected <= set(done.stdout.split()), done.stderr

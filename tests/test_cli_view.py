@@ -1,7 +1,5 @@
 """``igsr view`` with a display: starts splat-view with cameras that it can read."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import json
 import os
@@ -154,6 +152,11 @@ def test_igsr_writes_the_cameras_file_of_the_viewers_tests(tmp_path):
     assert written == {"camera_model": "PINHOLE", "frames": [frame]}
 
 
+def module(*words, **options):
+    command = [sys.executable, "-m", *words]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, **options)
+
+
 def test_the_viewer_imports_no_module_from_the_current_folder(tmp_path):
     scenes.splats().save(tmp_path / "scene.ply")
     (tmp_path / "igsr.py").write_text("raise SystemExit('the folder was searched for modules')")
@@ -161,14 +164,8 @@ def test_the_viewer_imports_no_module_from_the_current_folder(tmp_path):
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         environment.pop(name, None)
     options = ["--screenshot", "seen.png", "--size", "40x30", "--backend", "cpu"]
-    result = subprocess.run(
-        [sys.executable, "-m", "igsr.cli", "view", "scene.ply", *options],
-        cwd=tmp_path,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    words = ["igsr.cli", "view", "scene.ply", *options]
+    result = module(*words, cwd=tmp_path, env=environment)
     assert result.returncode == 0, result.stderr
     assert Image.open(tmp_path / "seen.png").size == (40, 30)
 
@@ -180,11 +177,6 @@ def test_the_package_has_the_program_splat_view():
         (["--version"], 0, f"splat-view {igsr.__version__}"),
         (["--nonsense"], 1, "--nonsense"),
     ):
-        result = subprocess.run(
-            [sys.executable, "-m", "igsr.rendering.window", *words],
-            capture_output=True,
-            text=True,
-            timeout=60,
-        )
+        result = module("igsr.rendering.window", *words)
         assert result.returncode == status
         assert text in result.stdout + result.stderr

@@ -1,7 +1,5 @@
 """``igsr.fit`` with a folder, and ``igsr fit``, which writes the same files."""
 
-from __future__ import annotations
-
 import json
 
 import pytest
@@ -41,10 +39,8 @@ def test_fit_returns_what_it_writes(fitted):
     assert result.scores.psnr == result.report["psnr"]
     assert [row["name"] for row in result.scores.views] == ["photos/00.png", "photos/04.png"]
     assert result.steps == result.settings.steps == 30
-    assert (
-        repr(result)
-        == f"FitResult({len(result.splats)} splats, 30 steps, {result.scores.psnr:.2f} dB)"
-    )
+    splats, psnr = len(result.splats), result.scores.psnr
+    assert repr(result) == f"FitResult({splats} splats, 30 steps, {psnr:.2f} dB)"
     stages = [event.stage for event in events]
     assert list(dict.fromkeys(stages)) == ["note", "fit", "scene written", "score"]
     assert [event.path for event in events if event.path] == [out / "scene.ply"]
@@ -55,11 +51,10 @@ def test_fit_returns_what_it_writes(fitted):
 
 def test_the_command_writes_the_same(fitted, photos, tmp_path, igsr_here):
     _, out, _ = fitted
-    options = [
-        word for key, value in SETTINGS.items() for word in (f"--{key.replace('_', '-')}", value)
-    ]
-    ran = igsr_here("fit", photos, "--out", tmp_path, *options)
+    options = [(f"--{name.replace('_', '-')}", value) for name, value in SETTINGS.items()]
+    ran = igsr_here("fit", photos, "--out", tmp_path, *sum(options, ()))
     assert ran.returncode == 0, ran.stderr
+    assert {path.name for path in tmp_path.iterdir()} == {path.name for path in out.iterdir()}
     assert (tmp_path / "scene.ply").read_bytes() == (out / "scene.ply").read_bytes()
     assert report_in(tmp_path) == report_in(out)
 

@@ -1,7 +1,5 @@
 """GPUs that fail: "auto" warns and uses the CPU; a fit ends with one message and its checkpoint."""
 
-from __future__ import annotations
-
 import re
 import warnings
 
@@ -13,16 +11,10 @@ from igsr import _core
 pytestmark = pytest.mark.usefixtures("no_faults_after")
 
 
-@pytest.fixture(scope="module")
-def verdicts(tmp_path_factory):
-    """A folder for the verdicts on GPUs that only these tests use."""
-    return tmp_path_factory.mktemp("verdicts")
-
-
 @pytest.fixture
-def no_faults_after(monkeypatch, verdicts):
-    """Open new devices for each test."""
-    monkeypatch.setenv("IGSR_GPU_CACHE", str(verdicts))
+def no_faults_after(monkeypatch, tmp_path_factory):
+    """Open new devices for each test, whose verdicts are in a folder of these tests."""
+    monkeypatch.setenv("IGSR_GPU_CACHE", str(tmp_path_factory.getbasetemp() / "verdicts"))
     yield
     _core.inject_gpu_faults([])
 
@@ -47,11 +39,10 @@ def test_auto_warns_once_and_uses_the_cpu(fault, message):
         _core.resolve_backend("gpu")
 
 
+@pytest.mark.filterwarnings("error")
 def test_a_software_adapter_gives_no_warning():
     _core.inject_gpu_faults([])
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert _core.resolve_backend("auto") in ("cpu", "gpu")
+    assert _core.resolve_backend("auto") in ("cpu", "gpu")
 
 
 def test_verdicts_are_kept_for_sound_devices_only(monkeypatch, tmp_path):

@@ -1,7 +1,5 @@
 """Memory of fits on a GPU does not grow with the steps."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``report.html`` of a refinement in a browser: its script runs, cameras and pictures appear."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

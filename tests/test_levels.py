@@ -1,7 +1,5 @@
 """Levels of detail: fewer splats that look alike from afar, in cells that viewers load."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
@@ -10,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
+from PIL import Image
 
 import igsr
 from igsr.capture import Camera
@@ -100,8 +99,6 @@ def test_negative_colors_are_merged_as_black(wall, tmp_path):
 
 def test_chunks_match_an_independent_decoder(levels):
     """Positions of a chunk, decoded in numpy by the published formulas, lie in its cells' boxes."""
-    from PIL import Image
-
     out, _ = levels
     index = json.loads((out / "lod-meta.json").read_text())
     leaves, nodes = [], [index["tree"]]
@@ -124,6 +121,12 @@ def test_chunks_match_an_independent_decoder(levels):
             assert (at <= np.array(leaf["bound"]["max"]) + 1e-3).all()
             checked += len(at)
     assert checked == index["count"]
+    # A chunk is a splat file, and the index is none.
+    chunk = igsr.Splats.load(out / index["filenames"][0])
+    assert 300 < len(chunk) <= 700
+    assert chunk.sh_degree == 1
+    with pytest.raises(igsr.IgsrError, match="levels of detail; open it with"):
+        igsr.Splats.load(out / "lod-meta.json")
 
 
 def test_the_page_shows_the_finest_level_that_fits(levels, monkeypatch):
@@ -138,16 +141,6 @@ def test_the_page_shows_the_finest_level_that_fits(levels, monkeypatch):
     assert len(coarse) == written.counts[1]
     with pytest.raises(igsr.IgsrError, match="more levels"):
         level_within(out / "lod-meta.json", 3)
-
-
-def test_a_chunk_is_a_splat_file(levels):
-    out, _ = levels
-    name = json.loads((out / "lod-meta.json").read_text())["filenames"][0]
-    chunk = igsr.Splats.load(out / name)
-    assert 300 < len(chunk) <= 700
-    assert chunk.sh_degree == 1
-    with pytest.raises(igsr.IgsrError, match="levels of detail; open it with"):
-        igsr.Splats.load(out / "lod-meta.json")
 
 
 @pytest.mark.parametrize("ending", ["spz", "compressed.ply", "sog"])

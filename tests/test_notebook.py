@@ -1,11 +1,9 @@
 """Notebooks that are run as Jupyter runs them: the viewer that a cell returns opens."""
 
-from __future__ import annotations
-
 import nbformat
 import pytest
 from nbclient import NotebookClient
-from scene_pages import model
+from scene_pages import WAIT, model
 
 import igsr
 
@@ -20,9 +18,6 @@ capture = igsr.Capture("photos", [])
 done = Round([], [], {}, {}, True, splats, None)
 Refined(splats, splats, None, capture, [done], None, [], {}).show(height=300)
 """
-#: The page in a notebook is a frame; this waits for it.
-WAIT = """<script>window.igsr = { ready: new Promise((resolve) => addEventListener("load", () =>
-    frames[0].igsr.ready.then(resolve))) }</script>"""
 
 
 @pytest.fixture(scope="module")
@@ -45,8 +40,5 @@ def test_a_notebook_cell_shows_the_viewer(browser, tmp_path, outputs, cell, labe
     assert found == labels
     assert browser.run("frames[0].igsr.viewer.main.scene.count") == 400
     assert browser.run("frames[0].innerHeight") == 300
-
-
-def test_a_height_below_one_pixel_is_refused():
     with pytest.raises(igsr.IgsrError, match="height"):
         model().show(height=0)

@@ -1,12 +1,11 @@
 """``rasterization``: gradients, gsplat's conventions, backends, and gsplat's own strategies."""
 
-from __future__ import annotations
-
 import math
 
 import gsplat
 import pytest
 import torch
+from gradients import check_gradients, intrinsic_matrices, leaves, lenses_of, weighted_sum
 from gsplat.utils import normalized_quat_to_rotmat
 from scenes import HEIGHT, WIDTH, torch_scene
 from scenes import rasterized as run
@@ -21,28 +20,18 @@ MODES = ["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 def test_reference_gradients_match_finite_differences(packed, render_mode):
     scene = torch_scene(count=6, dtype=torch.float64)
     # The camera's free numbers: gradcheck would also move the fixed rows, which no camera has.
-    poses = scene["viewmats"][:, :3].clone()
-    lenses = scene["Ks"][:, [0, 1, 0, 1], [0, 1, 2, 2]].clone()
+    poses, lenses = scene["viewmats"][:, :3].clone(), lenses_of(scene["Ks"])
     names = ["means", "quats", "scales", "opacities", "colors", "backgrounds"]
-    inputs = [scene[name] for name in names] + [poses, lenses]
 
     def render(*tensors):
         arguments = dict(zip(names, tensors, strict=False))
-        fixed_row = scene["viewmats"][:, 3:].detach()
-        arguments["viewmats"] = torch.cat([tensors[-2], fixed_row], dim=1)
-        fx, fy, cx, cy = tensors[-1].unbind(dim=1)
-        zero, one = torch.zeros_like(fx), torch.ones_like(fx)
-        K = torch.stack([fx, zero, cx, zero, fy, cy, zero, zero, one], dim=1)
-        arguments["Ks"] = K.reshape(-1, 3, 3)
+        arguments["viewmats"] = torch.cat([tensors[-2], scene["viewmats"][:, 3:]], dim=1)
+        arguments["Ks"] = intrinsic_matrices(tensors[-1])
         options = {"backend": "reference", "packed": packed, "render_mode": render_mode}
         color, alpha, _ = run(arguments, **options)
-        # One number from all pixels: every input is still checked one by one.
-        weights = torch.linspace(-1.0, 1.0, color.numel(), dtype=torch.float64)
-        return (color.flatten() * weights).sum() + alpha.square().sum()
+        return weighted_sum(color) + alpha.square().sum()
 
-    for tensor in inputs:
-        tensor.requires_grad_()
-    assert torch.autograd.gradcheck(render, inputs, eps=1e-6, atol=1e-6, rtol=1e-4)
+    check_gradients(render, [scene[name] for name in names] + [poses, lenses])
 
 
 @pytest.mark.parametrize("fast", ["cpu", "gpu"])
@@ -54,13 +43,10 @@ def test_backends_match_reference(fast, render_mode, sh_degree):
         scene = {name: tensor.to(dtype) for name, tensor in torch_scene(count=30).items()}
         if sh_degree is None:
             scene["colors"] = scene["colors"][:, 0].abs()
-        for tensor in scene.values():
-            tensor.requires_grad_()
-        color, alpha, _ = run(
-            scene, backend=backend, sh_degree=sh_degree, render_mode=render_mode, packed=False
-        )
-        weights = torch.linspace(-1.0, 1.0, color.numel(), dtype=dtype).reshape(color.shape)
-        ((color * weights).sum() + alpha.square().sum()).backward()
+        scene = leaves(scene)
+        options = {"backend": backend, "sh_degree": sh_degree, "render_mode": render_mode}
+        color, alpha, _ = run(scene, packed=False, **options)
+        (weighted_sum(color) + alpha.square().sum()).backward()
         gradients = {name: tensor.grad for name, tensor in scene.items()}
         results[backend] = (color.detach(), alpha.detach(), gradients)
     color, alpha, gradients = results[fast]
@@ -83,8 +69,7 @@ def test_packed_gives_the_same_picture_and_gradients():
     for packed in (False, True):
         scene = torch_scene(count=30)
         scene["means"][:5, 2] = -3.0  # behind the cameras
-        for tensor in scene.values():
-            tensor.requires_grad_()
+        scene = leaves(scene)
         color, alpha, meta = run(scene, packed=packed, render_mode="RGB+ED")
         meta["means2d"].retain_grad()
         color.square().sum().backward()
@@ -111,10 +96,8 @@ INPUTS = ["means", "quats", "scales", "opacities", "colors", "viewmats", "Ks"]
 
 def changed_before_backward(change, cameras, packed):
     """The gradients, or None if backward() refuses to compute them."""
-    scene = torch_scene(cameras=cameras)
+    scene = leaves(torch_scene(cameras=cameras))
     render_mode = "RGB" if cameras == 1 else "RGB+ED"
-    for tensor in scene.values():
-        tensor.requires_grad_()
     color, alpha, meta = run(scene, packed=packed, render_mode=render_mode)
     with torch.no_grad():
         change(scene, color, alpha, meta)

@@ -1,9 +1,8 @@
 """``rasterization``: any number of channels, backgrounds and masks per pixel, expected depth."""
 
-from __future__ import annotations
-
 import pytest
 import torch
+from gradients import check_gradients, check_scene, leaves
 from scenes import HEIGHT, WIDTH, rasterized, torch_scene
 
 BACKENDS = ["cpu", "reference"]
@@ -30,7 +29,7 @@ def run(scene, **options):
 
 
 def gradients(scene, loss):
-    tensors = {name: t.clone().requires_grad_() for name, t in scene.items()}
+    tensors = leaves(scene)
     loss(tensors).backward()
     return {name: tensor.grad for name, tensor in tensors.items()}
 
@@ -75,16 +74,8 @@ def test_gradients_of_channels_match_finite_differences(channels):
     scene = feature_scene(channels, dtype=torch.float64, count=5)
     scene["backgrounds"] = random(2, channels, dtype=torch.float64)
     names = ["means", "quats", "scales", "opacities", "colors", "backgrounds"]
-
-    def render(*tensors):
-        arguments = {**scene, **dict(zip(names, tensors, strict=True))}
-        picture, alpha, _ = run(arguments, backend="reference", render_mode="RGB+ED")
-        weights = torch.linspace(-1.0, 1.0, picture.numel(), dtype=torch.float64)
-        # alpha and depth come from one of the passes: were they counted in each, this would show.
-        return (picture.flatten() * weights).sum() + alpha.square().sum()
-
-    inputs = [scene[name].requires_grad_() for name in names]
-    assert torch.autograd.gradcheck(render, inputs, eps=1e-6, atol=1e-6, rtol=1e-4)
+    # Alpha and depth come from one of the passes: they must not count in each.
+    check_scene(scene, names, sh_degree=None, render_mode="RGB+ED")
 
 
 @pytest.mark.parametrize("render_mode", ["RGB", "RGB+ED"])
@@ -127,10 +118,8 @@ def test_gradients_of_pixel_backgrounds_match_finite_differences(channels):
         picture, alpha, _ = run(arguments, backend="reference", render_mode="RGB+ED", masks=masks)
         return picture.square().sum() + alpha.square().sum()
 
-    inputs = [torch.zeros((), dtype=torch.float64)] + [scene[name] for name in names]
-    for tensor in inputs:
-        tensor.requires_grad_()
-    assert torch.autograd.gradcheck(render, inputs, eps=1e-6, atol=1e-6, rtol=1e-4)
+    zero = torch.zeros((), dtype=torch.float64)
+    check_gradients(render, [zero, *(scene[name] for name in names)])
 
 
 @pytest.mark.parametrize("background", ["none", "uniform", "pixels"])
@@ -160,7 +149,7 @@ def test_masked_pixels_show_the_background_and_pass_no_gradient(packed, channels
     assert not normals[~masks].any()
 
     def gradients_given(v_masked):
-        tensors = {name: t.clone().requires_grad_() for name, t in scene.items()}
+        tensors = leaves(scene)
         picture, alpha, meta = run(tensors, masks=masks, **options)
         shown = torch.cat([picture, alpha, meta["render_normals"]], dim=-1)
         v_shown = shown.detach().clone()
@@ -190,19 +179,16 @@ def test_expected_depth_is_zero_where_nothing_is_drawn(render_mode, backend):
     scene = feature_scene(3, count=2, cameras=1)
     scene["means"][:] = torch.tensor([0.0, 0.0, 4.0])
     scene["scales"][:] = 0.2
-    depth = run(scene, render_mode=render_mode, backend=backend)[0][..., -1:]
-    alpha = run(scene, render_mode=render_mode, backend=backend)[1]
-    empty = alpha == 0
+    options = {"render_mode": render_mode, "backend": backend}
+    picture, alpha, _ = run(scene, **options)
+    depth, empty = picture[..., -1], alpha[..., 0] == 0
     assert 0 < empty.sum() < empty.numel()
     assert not depth[empty].any()
     assert (depth[~empty] - 4.0).abs().max() < 1e-4
 
     def loss(tensors):
         # 1e30 on every pixel: a division by a clamped alpha would make it overflow.
-        return (
-            run(tensors, render_mode=render_mode, backend=backend)[0][..., -1][empty[..., 0]].sum()
-            * 1e30
-        )
+        return 1e30 * run(tensors, **options)[0][..., -1][empty].sum()
 
     for name, gradient in gradients(scene, loss).items():
         assert not gradient.any(), name

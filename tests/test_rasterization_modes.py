@@ -1,10 +1,9 @@
 """``rasterization``: absolute gradients for density control, and the antialiased mode."""
 
-from __future__ import annotations
-
 import gsplat
 import pytest
 import torch
+from gradients import check_scene, leaves
 from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci
 from scenes import HEIGHT, WIDTH, torch_scene
 from scenes import rasterized as run
@@ -29,17 +28,9 @@ def test_absgrad_sums_the_absolute_gradients_of_all_pixels(
     dtype = torch.float64 if backend == "reference" else torch.float32
     scene = small_scene(cameras=cameras, dtype=dtype)
     scene["means"][1, 2] = -3.0  # one that is not drawn
-    for tensor in scene.values():
-        tensor.requires_grad_()
-    options = {
-        "sh_degree": 2,
-        "width": 8,
-        "height": 5,
-        "packed": packed,
-        "render_mode": render_mode,
-        "backend": backend,
-    }
-    picture, alpha, meta = rasterization(**scene, **options, absgrad=True)
+    size = {"width": 8, "height": 5, "sh_degree": 2}
+    options = {"packed": packed, "render_mode": render_mode, "backend": backend}
+    picture, alpha, meta = rasterization(**leaves(scene), **size, **options, absgrad=True)
     weights = torch.linspace(-1.0, 2.0, picture.numel(), dtype=dtype).reshape(picture.shape)
     pixels = (picture * weights).sum(dim=-1) + alpha[..., 0].square()
     means2d = meta["means2d"]
@@ -61,9 +52,7 @@ def test_absgrad_sums_the_absolute_gradients_of_all_pixels(
 def test_absgrad_changes_nothing_else_and_is_of_the_last_backward():
     outcomes = []
     for absgrad in (False, True):
-        scene = torch_scene(count=30)
-        for tensor in scene.values():
-            tensor.requires_grad_()
+        scene = leaves(torch_scene(count=30))
         picture, _, meta = run(scene, absgrad=absgrad)
         picture.square().sum().backward(retain_graph=True)
         outcomes.append([picture, *(tensor.grad for tensor in scene.values())])
@@ -102,15 +91,9 @@ def test_antialiased_opacities_match_gsplat(eps2d):
     _, _, meta = run(scene, rasterize_mode="antialiased", **options)
     _, _, classic = run(scene, **options)
     covars, _ = _quat_scale_to_covar_preci(scene["quats"], scene["scales"], True, False, False)
+    cameras = (scene["viewmats"], scene["Ks"], WIDTH, HEIGHT)
     _, _, _, conics, compensations = _fully_fused_projection(
-        scene["means"],
-        covars,
-        scene["viewmats"],
-        scene["Ks"],
-        WIDTH,
-        HEIGHT,
-        eps2d,
-        calc_compensations=True,
+        scene["means"], covars, *cameras, eps2d, calc_compensations=True
     )
     expected = scene["opacities"] * compensations
     drawn = (meta["radii"] > 0).all(dim=-1)
@@ -137,18 +120,5 @@ def test_antialiased_gradients_match_finite_differences(packed):
     scene = torch_scene(count=6, dtype=torch.float64)
     scene["scales"] = scene["scales"] * 0.3  # small ones, whose opacity depends on their size
     names = ["means", "quats", "scales", "opacities", "colors"]
-
-    def render(*tensors):
-        arguments = {**scene, **dict(zip(names, tensors, strict=True))}
-        picture, alpha, _ = run(
-            arguments,
-            backend="reference",
-            packed=packed,
-            render_mode="RGB+ED",
-            rasterize_mode="antialiased",
-        )
-        weights = torch.linspace(-1.0, 1.0, picture.numel(), dtype=torch.float64)
-        return (picture.flatten() * weights).sum() + alpha.square().sum()
-
-    inputs = [scene[name].requires_grad_() for name in names]
-    assert torch.autograd.gradcheck(render, inputs, eps=1e-6, atol=1e-6, rtol=1e-4)
+    options = {"render_mode": "RGB+ED", "rasterize_mode": "antialiased"}
+    check_scene(scene, names, packed=packed, **options)

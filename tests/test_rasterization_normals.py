@@ -1,11 +1,10 @@
 """``rasterization(render_normals=True)``: the axis, the frame and the weights."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
 import torch
+from gradients import check_gradients, weighted_sum
 from scenes import HEIGHT, WIDTH, rasterized, torch_scene
 
 
@@ -85,8 +84,8 @@ def test_normals_have_the_weights_of_the_colors_and_change_no_picture(render_mod
     centers = -scene["viewmats"][:, :3, 3]  # these cameras are not turned
     towards = centers[:, None].double() - scene["means"]
     facing = (towards * normals).sum(dim=-1, keepdim=True).sign() * normals
-    colors = facing.float()
-    expected, _, _ = rasterized({**scene, "colors": colors, "backgrounds": None}, sh_degree=None)
+    plain_scene = {**scene, "colors": facing.float(), "backgrounds": None}
+    expected, _, _ = rasterized(plain_scene, sh_degree=None)
     assert (meta["render_normals"] - expected).abs().max() <= 2e-6
 
 
@@ -97,11 +96,10 @@ def test_gradients_of_normals_match_finite_differences():
     def render(*tensors):
         arguments = {**scene, **dict(zip(names, tensors, strict=True))}
         picture, _, meta = run(arguments, backend="reference", render_mode="RGB+D")
-        weights = torch.linspace(-1.0, 1.0, meta["render_normals"].numel(), dtype=torch.float64)
-        return (meta["render_normals"].flatten() * weights).sum() + picture.square().sum()
+        return weighted_sum(meta["render_normals"]) + picture.square().sum()
 
-    inputs = [scene[name].requires_grad_() for name in names]
-    assert torch.autograd.gradcheck(render, inputs, eps=1e-6, atol=1e-6, rtol=1e-4)
+    inputs = [scene[name] for name in names]
+    check_gradients(render, inputs)
     _, _, meta = run(scene, backend="reference")
     (from_normals,) = torch.autograd.grad(meta["render_normals"][..., 0].sum(), inputs[1])
     assert from_normals.abs().max() > 1e-3

@@ -3,10 +3,9 @@
 The profile in conftest.py makes the draws the same on every run.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
+from gradients import leaves
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import torch_scene
@@ -58,11 +57,10 @@ def calls(draw, least=0):
 
 def outcome(scene, options):
     """The picture, alpha and normals, and the gradients of all inputs of one loss of them."""
-    tensors = {name: tensor.clone().requires_grad_() for name, tensor in scene.items()}
+    tensors = leaves(scene)
     picture, alpha, meta = rasterization(**tensors, **options)
-    shown = torch.cat(
-        [picture, alpha, *([meta["render_normals"]] if options["render_normals"] else [])], dim=-1
-    )
+    normals = [meta["render_normals"]] if options["render_normals"] else []
+    shown = torch.cat([picture, alpha, *normals], dim=-1)
     # Chosen by the picture's place only, so that it is the same whatever a splat does to the rest.
     weights = torch.linspace(-1.0, 1.0, shown.numel(), dtype=shown.dtype).reshape(shown.shape)
     shown.backward(weights)

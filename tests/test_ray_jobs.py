@@ -1,6 +1,4 @@
-"""Work over Ray: what is said where Ray, a cluster or a machine cannot be used."""
-
-from __future__ import annotations
+"""Work over Ray: messages if Ray, a cluster or a machine cannot be used."""
 
 import socket
 import sys
@@ -29,24 +27,19 @@ def test_ray_that_is_missing_or_of_another_version_is_named(ray, monkeypatch):
         RayCluster().__enter__()
 
 
-@pytest.mark.parametrize(
-    ("error", "reason"),
-    [
-        (ConnectionError("Could not find any running Ray instance.\nMore."), "Could not find any"),
-        (RuntimeError("Version mismatch: The cluster was started with:\n Ray: 2.1"), "Version mis"),
-    ],
-)
-def test_a_cluster_that_cannot_be_joined_is_named(ray, error, reason):
-    ray.refuses = error
-    with pytest.raises(igsr.IgsrError, match=f"Ray cluster at auto: {reason}"):
-        RayCluster("auto").__enter__()
-    assert ray.addresses == ["auto"]
-
-
-def test_a_head_that_nobody_answers_for_is_named_at_once(ray):
+def test_a_cluster_that_cannot_be_joined_is_named(ray):
+    # No head answers at this address, so Ray is not asked.
     with pytest.raises(igsr.IgsrError, match=r"Ray cluster at 127\.0\.0\.1:9: .*refused"):
         RayCluster("127.0.0.1:9").__enter__()
     assert ray.addresses == []
+    for error in (
+        ConnectionError("Could not find any running Ray instance.\nMore."),
+        RuntimeError("Version mismatch: The cluster was started with:\n Ray: 2.1"),
+    ):
+        ray.refuses = error
+        with pytest.raises(igsr.IgsrError, match=f"Ray cluster at auto: {str(error)[:18]}"):
+            RayCluster("auto").__enter__()
+    assert ray.addresses == ["auto", "auto"]
 
 
 @pytest.mark.parametrize(
@@ -90,14 +83,12 @@ def test_lost_work_is_retried(ray):
         assert isinstance(error, WorkerLostError if piece == "large" else MemoryError)
         return f"less of {piece}"
 
-    memory = {"fine": None, "large": 5, "larger": 10**12}.get
+    memory = {"fine": None, "large": 5, "larger": 10**12}
     with RayCluster() as cluster:
-        cluster.run(
-            work, ["fine", "large", "larger"], results.__setitem__, memory=memory, retry=retry
-        )
+        cluster.run(work, [*memory], results.__setitem__, memory=memory.get, retry=retry)
     smaller = ["less of large", "less of larger"]
     assert results == {piece: f"did {piece}" for piece in ["fine", *smaller]}
-    assert sorted(begun) == ["fine", "large", "larger", *smaller]
+    assert sorted(begun) == [*memory, *smaller]
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """Scores, and the reports of a fit: report.json, report.html and views.png."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

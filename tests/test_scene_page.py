@@ -1,13 +1,12 @@
 """``scene.html`` in a real browser: pictures as the renderer's, mouse, touch and keys."""
 
-from __future__ import annotations
-
 import base64
 import re
 import time
 
 import numpy as np
 import pytest
+import scene_pages
 import scenes
 from scene_pages import BACKGROUND, MEAN, check_pictures, drawn, model, named, opened, three_cameras
 
@@ -16,7 +15,7 @@ from igsr.rendering import scene_model
 from igsr.rendering.renders import render
 from igsr.rendering.scene_page import PageCamera, scene_page, write_scene_page
 
-# ---- pictures ----------------------------------------------------------------------------------
+MESSAGE = "document.getElementById('message').textContent"
 
 
 @pytest.mark.parametrize("degree", range(5))
@@ -40,9 +39,8 @@ def test_scenes_in_any_unit(browser, tmp_path, size):
     splats = model(size=size)
     opened(browser, tmp_path / "scene.html", splats)
     # The renderer's near plane is 0.01 in any unit; it draws the same scene in another one.
-    enlarged = model(size=1.0)
     for camera, same in zip(three_cameras(size), three_cameras(), strict=True):
-        expected = render(enlarged, same, BACKGROUND, backend="cpu").to_uint8().astype(int)
+        expected = scene_pages.picture(model(), same, BACKGROUND)
         assert np.abs(drawn(browser, camera) - expected).mean() <= MEAN
 
 
@@ -96,9 +94,6 @@ def test_depth_view_and_focus(browser, tmp_path):
     assert before["distance"] == pytest.approx(3.0, rel=0.1)
 
 
-# ---- the page ----------------------------------------------------------------------------------
-
-
 def test_the_page_makes_no_requests(browser, tmp_path):
     path = opened(browser, tmp_path / "scene.html", model(), named(three_cameras()))
     assert browser.problems == []
@@ -107,12 +102,10 @@ def test_the_page_makes_no_requests(browser, tmp_path):
     assert others == [path.as_uri()]
     page = path.read_text(encoding="utf-8")
     assert not re.search(r"(?:https?:)?//[\w.-]+\.\w", page)
-    policy = re.search(r'Content-Security-Policy" content="([^"]+)"', page)
-    assert policy is not None
-    assert policy[1].startswith("default-src 'none'; script-src 'sha256-")
-    assert "unsafe" not in policy[1]
-    refused = browser.run("fetch('https://example.org/').then(() => false, () => true)")
-    assert refused
+    policy = re.search(r'Content-Security-Policy" content="([^"]+)"', page)[1]
+    assert policy.startswith("default-src 'none'; script-src 'sha256-")
+    assert "unsafe" not in policy
+    assert browser.run("fetch('https://example.org/').then(() => false, () => true)")
 
 
 def test_mouse_and_keys_move_the_camera(browser, tmp_path):
@@ -204,34 +197,26 @@ def test_an_empty_model_gives_a_message(browser, tmp_path):
     empty = igsr.Splats(*(np.zeros(shape, np.float32) for shape in shapes))
     write_scene_page(tmp_path / "scene.html", empty)
     browser.open(tmp_path / "scene.html")
-    assert (
-        browser.run("document.getElementById('message').textContent") == "The scene has no splats."
-    )
+    assert browser.run(MESSAGE) == "The scene has no splats."
     assert browser.problems == []
 
 
 @pytest.mark.parametrize("damage", ["cut", "byte", "base64", "other", "count"])
 def test_a_damaged_page_gives_a_message(browser, tmp_path, damage):
     page, _ = scene_page(model())
-    found = re.search(r'id="model-0">([^<]+)<', page)
-    assert found is not None
-    text = found[1]
-    if damage == "count":
-        page = page.replace('"count": 400', '"count": 399')
-    else:
-        packed = bytearray(base64.b64decode(text))
-        packed[len(packed) // 2] ^= 0xFF
-        damaged = {
-            "cut": text[: len(text) // 2 // 4 * 4],
-            "byte": base64.b64encode(packed).decode(),
-            "base64": "?" + text[1:],
-            "other": base64.b64encode(b"no splats at all").decode(),
-        }[damage]
-        page = page.replace(text, damaged)
-    (tmp_path / "scene.html").write_text(page, encoding="utf-8")
+    text = re.search(r'id="model-0">([^<]+)<', page)[1]
+    packed = bytearray(base64.b64decode(text))
+    packed[len(packed) // 2] ^= 0xFF
+    old, new = {
+        "cut": (text, text[: len(text) // 2 // 4 * 4]),
+        "byte": (text, base64.b64encode(packed).decode()),
+        "base64": (text, "?" + text[1:]),
+        "other": (text, base64.b64encode(b"no splats at all").decode()),
+        "count": ('"count": 400', '"count": 399'),
+    }[damage]
+    (tmp_path / "scene.html").write_text(page.replace(old, new), encoding="utf-8")
     browser.open(tmp_path / "scene.html")
-    message = browser.run("document.getElementById('message').textContent")
-    assert message.startswith("The model in this page cannot be read: it")
+    assert browser.run(MESSAGE).startswith("The model in this page cannot be read: it")
     assert browser.run("getComputedStyle(document.getElementById('loading')).display") != "none"
     assert browser.problems == []
 
@@ -268,9 +253,6 @@ def test_a_wrong_background_is_refused(tmp_path, background):
     assert not list(tmp_path.iterdir())
 
 
-# ---- large models --------------------------------------------------------------------------------
-
-
 @pytest.mark.long
 def test_a_million_splats(browser, tmp_path):
     splats = model(0, 1_000_000)
@@ -286,5 +268,5 @@ def test_a_million_splats(browser, tmp_path):
     drawn(browser, camera, 600.0)
     # The second picture: the browser has drawn the page's first by then.
     print(f"{path.stat().st_size / 1e6:.1f} MB, drawn after {time.monotonic() - started:.1f} s")
-    expected = render(splats, camera, BACKGROUND, backend="cpu").to_uint8()
+    expected = scene_pages.picture(splats, camera, BACKGROUND)
     assert np.abs(drawn(browser, camera, 600.0) - expected).mean() <= MEAN

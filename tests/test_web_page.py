@@ -1,14 +1,13 @@
 """The page of ``igsr view --web`` in a browser: follows a run and compares models."""
 
-from __future__ import annotations
-
 import json
 import time
 
 import numpy as np
 import pytest
+import scene_pages
 from PIL import Image
-from scene_pages import MEAN, drawn, model, named, three_cameras
+from scene_pages import MEAN, check_pictures, drawn, model, named, picture, three_cameras
 from web_views import served
 
 import igsr
@@ -16,7 +15,6 @@ from igsr._internal.event import Event
 from igsr.capture.write_transforms import write_cameras
 from igsr.fitting.followed_run import FollowedRun
 from igsr.rendering import scene_page
-from igsr.rendering.renders import render
 from igsr.rendering.scene_page import PageModel, write_scene_page
 
 BLACK = (0.0, 0.0, 0.0)
@@ -44,10 +42,6 @@ def wait_for(browser, expression, seconds=20.0):
         time.sleep(0.05)
 
 
-def picture(splats, camera):
-    return render(splats, camera, BLACK, backend="cpu").to_uint8().astype(int)
-
-
 def write_round(folder, number):
     """Write the files of a refinement after a round."""
     rounds = [{"splats": 300, "test": {"psnr": 20.0 + k}, "accepted": True} for k in range(number)]
@@ -70,8 +64,8 @@ def choose(browser, id, value):
 
 
 def test_the_page_shows_new_rounds_without_a_reload(browser, tmp_path):
-    views = [igsr.View("a.png", camera, "train", np.zeros((144, 160, 3), np.uint8))
-             for camera in three_cameras()]  # fmt: skip
+    photo = np.zeros((144, 160, 3), np.uint8)
+    views = [igsr.View("a.png", camera, "train", photo) for camera in three_cameras()]
     with served(tmp_path) as server:
         browser.open(server.url)
         message = browser.run("document.getElementById('message').textContent")
@@ -95,11 +89,10 @@ def test_the_page_shows_new_rounds_without_a_reload(browser, tmp_path):
             "round 2, 22.00 dB",
         ]
         assert texts(browser, "#scores tr:last-child td")[:2] == ["round 2: accepted", "22.00"]
-        camera = three_cameras()[1]
-        assert np.abs(drawn(browser, camera) - picture(ROUNDS[2], camera)).mean() <= MEAN
+        check_pictures(browser, ROUNDS[2], three_cameras()[1:2], BLACK)
         choose(browser, "shown", "round-0")
         wait_for(browser, "window.igsr.viewer.main.scene.count === 300")
-        assert np.abs(drawn(browser, camera) - picture(ROUNDS[0], camera)).mean() <= MEAN
+        check_pictures(browser, ROUNDS[0], three_cameras()[1:2], BLACK)
         # A new run replaces the file of a round.
         ROUNDS[1].save(tmp_path / "rounds" / "0" / "scene.ply")
         wait_for(browser, "window.igsr.viewer.main.scene.count === 400")
@@ -122,13 +115,12 @@ def test_two_rounds_at_a_divider(browser, tmp_path):
     assert texts(browser, "#divider span") == ["round 0", "round 2"]
     camera = three_cameras()[0]
     for left in (0, 1):
-        if left == 1:
-            choose(browser, "beside", "1")
-            wait_for(browser, "window.igsr.viewer.other?.scene.count === 400")
+        choose(browser, "beside", left)
+        wait_for(browser, f"window.igsr.viewer.other?.scene.count === {len(ROUNDS[left])}")
         for part in (0.5, 0.25):
             browser.run(f"window.igsr.viewer.divider = {part}")
             seen, at = drawn(browser, camera), round(160 * part)
-            one, other = picture(ROUNDS[left], camera), picture(ROUNDS[2], camera)
+            one, other = (picture(ROUNDS[k], camera, BLACK) for k in (left, 2))
             assert np.abs(one - other).mean() > 5 * MEAN
             assert np.abs(seen[:, :at] - one[:, :at]).mean() <= MEAN
             assert np.abs(seen[:, at:] - other[:, at:]).mean() <= MEAN
@@ -149,7 +141,7 @@ def test_two_rounds_at_a_divider(browser, tmp_path):
 
 def test_a_photo_is_aligned_with_its_render(browser, tmp_path):
     camera = three_cameras()[0]
-    photo = picture(ROUNDS[1], camera).astype(np.uint8)
+    photo = picture(ROUNDS[1], camera, BLACK).astype(np.uint8)
     capture = igsr.Capture(tmp_path, [igsr.View("a/b.png", camera, "test", photo)])
     followed = FollowedRun(tmp_path)
     followed.show(capture, BLACK)
@@ -171,9 +163,8 @@ def test_a_photo_is_aligned_with_its_render(browser, tmp_path):
                 f"document.getElementById('shown').blur(); window.igsr.divider.move({part})"
             )
             browser.screenshot(tmp_path / f"{part}.png")
-            screens[part] = np.asarray(Image.open(tmp_path / f"{part}.png").convert("RGB")).astype(
-                int
-            )
+            screen = Image.open(tmp_path / f"{part}.png").convert("RGB")
+            screens[part] = np.asarray(screen).astype(int)
         assert browser.problems == []
     # The picture is 533 pixels wide in the window of 640 x 480: 3.3 for one of the photo's.
     middle = np.s_[20:-20, 80:-80]
@@ -225,20 +216,14 @@ def test_large_pages_show_the_last_model_alone(monkeypatch):
 
 def test_a_refinement_shows_itself_in_a_notebook(browser, helped, tmp_path):
     refined, out, _ = helped
-    wait = """<script>window.igsr = { ready: new Promise((resolve) => addEventListener("load", () =>
-        frames[0].igsr.ready.then(resolve))) }</script>"""
-    (tmp_path / "book.html").write_text(wait + refined.show(300)._repr_html_(), encoding="utf-8")
-    for page in (tmp_path / "book.html", tmp_path / "report.html"):
-        if page.name == "report.html":
-            page.write_text(wait + (out / "report.html").read_text(encoding="utf-8"), "utf-8")
+    page = tmp_path / "book.html"
+    for text in (refined.show(300)._repr_html_(), (out / "report.html").read_text("utf-8")):
+        page.write_text(scene_pages.WAIT + text, encoding="utf-8")
         browser.open(page)
         assert browser.problems == []
         assert browser.run("frames[0].igsr.error") is None
-        assert browser.run("frames[0].igsr.models.source.entries.map(({label}) => label)") == [
-            "first fit",
-            "round 1",
-            "round 2",
-        ]
+        labels = browser.run("frames[0].igsr.models.source.entries.map(({label}) => label)")
+        assert labels == ["first fit", "round 1", "round 2"]
         assert browser.run("frames[0].igsr.viewer.other.scene.count") == len(refined.first)
         others = [url for url in browser.requests if not url.startswith(("blob:", "data:"))]
         assert others in ([page.as_uri()], [page.as_uri(), "about:srcdoc"])

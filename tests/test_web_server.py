@@ -1,16 +1,10 @@
 """The server of ``igsr view --web``: access, models and photos, bad requests, the command."""
 
-from __future__ import annotations
-
 import json
 import os
-import signal
 import socket
 import struct
-import subprocess
-import sys
 import time
-import urllib.request
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -18,7 +12,7 @@ import pytest
 import scenes
 from PIL import Image
 from scene_pages import model
-from web_views import asked, served, state_of, with_token
+from web_views import asked, served, started_view, state_of, view_until_ctrl_c, with_token
 
 import igsr
 from igsr._internal.event import Event
@@ -43,16 +37,8 @@ def scene(tmp_path_factory):
 def test_requests_without_the_token_are_refused(scene, name):
     with served(scene) as server:
         right = server.token
-        for wrong in (
-            "",
-            right[:-1],
-            right + "x",
-            right.swapcase(),
-            "é",
-            "%00",
-            "/[",
-            f"x/../{right}",
-        ):
+        near = (right[:-1], right + "x", right.swapcase(), f"x/../{right}")
+        for wrong in (*near, "", "é", "%00", "/["):
             status, content = asked(server, f"/{wrong}/{name}")
             assert status == 403
             assert right.encode() not in content
@@ -62,36 +48,21 @@ def test_requests_without_the_token_are_refused(scene, name):
         assert asked(another, f"/{right}/{name}")[0] == 403
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "../secret.txt",
-        "..%2fsecret.txt",
-        "%2e%2e/secret.txt",
-        "secret.txt",
-        "//secret.txt",
-        "./secret.txt",
-        "model?id=../secret.txt",
-        "model?id=secret.txt",
-        "model?id=%00",
-        "model",
-        "photo?number=../secret.txt",
-        "photo?number=-1",
-        "photo?number=99",
-        "photo",
-        "static/../secret.txt",
-    ],
-)
-def test_names_are_not_paths(tmp_path, scene, name):
+def test_names_are_not_paths(tmp_path, scene):
     folder = tmp_path / "folder"
     folder.mkdir()
     (folder / "scene.ply").write_bytes(scene.read_bytes())
     for place in (folder, tmp_path):
         (place / "secret.txt").write_bytes(SECRET)
+    paths = [f"{part}secret.txt" for part in ("", "../", "..%2f", "%2e%2e/", "//", "./")]
+    paths += ["static/../secret.txt"]
+    models = ["model", *(f"model?id={id}" for id in ("../secret.txt", "secret.txt", "%00"))]
+    photos = ["photo", *(f"photo?number={n}" for n in ("../secret.txt", "-1", "99"))]
     with served(folder) as server:
-        status, content = with_token(server, name)
-        assert status == 404
-        assert SECRET not in content
+        for name in (*paths, *models, *photos):
+            status, content = with_token(server, name)
+            assert status == 404, name
+            assert SECRET not in content
 
 
 def test_photos_outside_of_the_folder_are_not_shown(tmp_path):
@@ -200,10 +171,8 @@ def test_a_fit_and_its_checkpoint(tmp_path):
         assert found.means.tobytes() == fitted.means.tobytes()
         around = json.loads(with_token(server, "surroundings")[1])
         assert around["background"] == [1.0, 0.5, 0.0]
-        assert [one["name"] for one in around["cameras"]] == [
-            "held-out/photos/00.jpg",
-            "held-out/photos/04.jpg",
-        ]
+        names = [one["name"] for one in around["cameras"]]
+        assert names == ["held-out/photos/00.jpg", "held-out/photos/04.jpg"]
         status, photo = with_token(server, around["cameras"][1]["photo"])
         assert status == 200
         (tmp_path / "photo.jpg").write_bytes(photo)
@@ -225,11 +194,8 @@ def test_scenes_of_an_earlier_run_are_labeled(tmp_path):
     followed(Event("fit", part=0.0))
     (tmp_path / "checkpoint.npz").write_bytes(b"damaged")
     with served(tmp_path) as server:
-        state = state_of(server)
-        assert [one["label"] for one in state["models"]] == [
-            "scene of an earlier run",
-            "being fitted",
-        ]
+        labels = [one["label"] for one in state_of(server)["models"]]
+        assert labels == ["scene of an earlier run", "being fitted"]
         status, content = with_token(server, "model?id=checkpoint")
         assert status == 422
         assert b"checkpoint.npz" in content
@@ -239,14 +205,10 @@ def test_a_refinement_has_rounds_and_their_scores(tmp_path):
     for number in (0, 1, 10):
         model(0).save(tmp_path / "rounds" / str(number) / "scene.ply")
     (tmp_path / "rounds" / "x").mkdir()
+    validation = {"before": {"psnr": 21.0}, "after": {"psnr": 20.5}}
     rounds = [
         {"splats": 400, "test": {"psnr": 20.0}, "accepted": True},
-        {
-            "splats": None,
-            "test": None,
-            "accepted": False,
-            "cross_validation": {"before": {"psnr": 21.0}, "after": {"psnr": 20.5}},
-        },
+        {"splats": None, "test": None, "accepted": False, "cross_validation": validation},
     ]
     (tmp_path / "report.json").write_text(json.dumps({"rounds": rounds}))
     checkpoint = tmp_path / "checkpoints" / "whole-round2.npz"
@@ -255,17 +217,11 @@ def test_a_refinement_has_rounds_and_their_scores(tmp_path):
     (tmp_path / "checkpoints" / "fold0.npz").write_bytes(b"")
     with served(tmp_path) as server:
         state = state_of(server)
-        assert [one["id"] for one in state["models"]] == [
-            "round-0",
-            "round-1",
-            "round-10",
-            "checkpoint",
-        ]
-        assert [one["label"] for one in state["models"]] == [
-            "first fit, 20.00 dB",
-            "round 1",
-            "round 10",
-            "round 2, being fitted",
+        assert [(one["id"], one["label"]) for one in state["models"]] == [
+            ("round-0", "first fit, 20.00 dB"),
+            ("round-1", "round 1"),
+            ("round-10", "round 10"),
+            ("checkpoint", "round 2, being fitted"),
         ]
         assert state["scores"]["rows"] == [
             ["first fit", "20.00", "–", "400"],
@@ -318,24 +274,16 @@ def test_a_run_without_news_is_labeled(tmp_path, monkeypatch):
     (tmp_path / "report.json").write_text('{"psnr": 20, "ssim": 0.5, "protocol": {}}')
     assert run_scores(tmp_path)["rows"] == [], "the report is of an earlier run"
     (folder / "progress.json").unlink()
-    assert run_scores(tmp_path)["rows"] == [
-        ["fitted photos", "20.00", "0.5000", run_folder.MISSING]
-    ]
+    (row,) = run_scores(tmp_path)["rows"]
+    assert row == ["fitted photos", "20.00", "0.5000", run_folder.MISSING]
 
 
-def started(tmp_path, *words):
-    environment = {**os.environ, "PATH": str(tmp_path)}
-    for name in ("DISPLAY", "WAYLAND_DISPLAY", "SSH_CONNECTION"):
-        environment.pop(name, None)
-    return subprocess.Popen(
-        [sys.executable, "-m", "igsr.cli", "view", *map(str, words)],
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        # Children of a shell's background jobs ignore Ctrl-C.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
+@pytest.fixture
+def environment(tmp_path):
+    """Variables of a process without a display and programs."""
+    hidden = ("DISPLAY", "WAYLAND_DISPLAY", "SSH_CONNECTION")
+    kept = {name: value for name, value in os.environ.items() if name not in hidden}
+    return {**kept, "PATH": str(tmp_path)}
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Ctrl-C is a signal here")
@@ -347,19 +295,11 @@ def started(tmp_path, *words):
         (["--web", "--host", "0.0.0.0"], ["is open to other computers", "Press Ctrl-C to stop."]),
     ],
 )
-def test_the_command_serves_until_ctrl_c(tmp_path, scene, options, notices):
-    process = started(tmp_path, scene, *options)
-    try:
-        url = process.stdout.readline().strip()
-        local = url if "0.0.0.0" not in options else f"http://127.0.0.1:{url.split(':')[2]}"
-        with urllib.request.urlopen(f"{local}state", timeout=30) as answer:
-            assert json.load(answer)["newest"] == "scene"
-        if not options or options == ["--web"]:
-            assert url.startswith("http://127.0.0.1:")
-    finally:
-        process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=30)
-    assert process.returncode == 0, errors
+def test_the_command_serves_until_ctrl_c(tmp_path, environment, scene, options, notices):
+    url, state, status, errors = view_until_ctrl_c(tmp_path, environment, scene, *options)
+    assert status == 0, errors
+    assert state["newest"] == "scene"
+    assert "0.0.0.0" in options or url.startswith("http://127.0.0.1:")
     lines = errors.splitlines()
     assert len(lines) == len(notices), errors
     for line, notice in zip(lines, notices, strict=True):
@@ -373,15 +313,15 @@ def test_the_command_serves_until_ctrl_c(tmp_path, scene, options, notices):
         (["no.ply"], "There is no file or folder no.ply"),
         (["SCENE", "--web", "--camera", "3"], "--camera is an option of splat-view"),
         (["SCENE", "--camera", "3"], "--camera needs a window, and there is no display"),
-        (["DAMAGED", "--web"], "damaged.ply"),
+        (["damaged.ply", "--web"], "damaged.ply"),
         (["SCENE", "--web", "--host", "192.0.2.1"], "Cannot listen at 192.0.2.1"),
         (["SCENE", "--web", "--cameras", "no"], "no"),
     ],
 )
-def test_wrong_arguments_are_errors(tmp_path, scene, words, message):
+def test_wrong_arguments_are_errors(tmp_path, environment, scene, words, message):
     (tmp_path / "damaged.ply").write_text("no splats")
-    named = {"SCENE": scene, "DAMAGED": tmp_path / "damaged.ply"}
-    process = started(tmp_path, *(named.get(word, word) for word in words))
+    words = [scene if word == "SCENE" else word for word in words]
+    process = started_view(tmp_path, environment, *words)
     out, errors = process.communicate(timeout=60)
     assert process.returncode == 1
     assert out == ""

@@ -1,18 +1,12 @@
-"""igsr without torch: what works, and what says which extra it lacks."""
-
-from __future__ import annotations
+"""igsr without torch: commands that work, and messages that name the missing extra."""
 
 import json
-import sys
 
 import pytest
 import scenes
 import without_torch
 from PIL import Image
 from web_views import view_until_ctrl_c
-
-import igsr
-from igsr.errors import MissingExtraError
 
 #: Packages and modules that may need torch.
 OF_REFINE = (
@@ -96,11 +90,13 @@ def test_commands_on_the_scene_work(fitted, words, made):
 
 def test_the_browser_view_shows_it(fitted):
     folder, _ = fitted
-    command = [sys.executable, "-m", "igsr.cli", "view", "--web", "out"]
     variables = {**without_torch.environment(folder / "site"), "DISPLAY": ""}
-    state, _, errors = view_until_ctrl_c(command, folder, variables)
+    _, state, _, errors = view_until_ctrl_c(folder, variables, "--web", "out")
     assert state["newest"] == "scene"
     assert "Traceback" not in errors
+
+
+DUST3R = ["--estimator", "dust3r", "--checkpoint", "x.pth"]
 
 
 @pytest.mark.parametrize(
@@ -108,10 +104,7 @@ def test_the_browser_view_shows_it(fitted):
     [
         (["refine", "--example", "--out", "refined"], "igsr refine"),
         (["denoise", "a.ply", "--capture", "x", "--out", "y"], "igsr denoise"),
-        (
-            ["fit", "photos", "--out", "y", "--estimator", "dust3r", "--checkpoint", "x.pth"],
-            "estimator dust3r",
-        ),
+        (["fit", "photos", "--out", "y", *DUST3R], "estimator dust3r"),
         (["pose", "photos", "--out", "y", "--estimator", "da3"], "estimator da3"),
     ],
 )
@@ -134,7 +127,8 @@ for name in igsr.__all__:
     try:
         getattr(igsr, name)
     except igsr.MissingExtraError as error:
-        assert isinstance(error, ImportError) and error.extra == "refine"
+        assert isinstance(error, ImportError) and isinstance(error, igsr.IgsrError)
+        assert error.extra == "refine"
         print(error)
 """
     result = without_torch.python(tmp_path, "-c", code)
@@ -161,10 +155,3 @@ def test_only_modules_of_the_extra_need_torch(tmp_path):
     assert "igsr.denoiser.network" in needing
     outside = [name for name in needing if not name.startswith(OF_REFINE)]
     assert outside == []
-
-
-def test_a_missing_extra_is_an_import_error_and_an_error_of_igsr():
-    error = MissingExtraError("igsr refine", "torch", "refine")
-    assert isinstance(error, igsr.IgsrError)
-    assert isinstance(error, ImportError)
-    assert str(error) == "igsr refine needs torch: pip install 'igsr[refine]'."

@@ -55,4 +55,4 @@ def _runs(process):
     except ProcessLookupError:
         return False
     stat = subprocess.run(["ps", "-o", "stat=", "-p", str(process)], capture_output=True, text=True)
-    return not stat.stdout.startswith("Z")  # ended, but nobody has asked how
+    return not stat.stdout.startswith("Z")  # it has ended

@@ -1,6 +1,4 @@
-"""The recipes of wheels stand in the form that hosting sites run, and name what is there."""
-
-from __future__ import annotations
+"""The recipes of wheels stand in the form that hosting sites run, and name existing things."""
 
 import re
 import shutil
@@ -15,26 +13,22 @@ WORKFLOW = ROOT / ".github" / "workflows" / "wheels.yml"
 
 
 def checked(path):
-    """What check-jsonschema says of a workflow; its schema comes with the package."""
+    """The result of check-jsonschema for a workflow; its schema comes with the package."""
     program = Path(sys.executable).with_name("check-jsonschema")
     command = [str(program), "--builtin-schema", "vendor.github-workflows", str(path)]
     return subprocess.run(command, capture_output=True, text=True, timeout=60)
 
 
-def test_the_workflow_keeps_to_the_schema_of_workflows():
+def test_the_workflow_keeps_to_the_schema_of_workflows(tmp_path):
     result = checked(WORKFLOW)
     assert result.returncode == 0, result.stdout
-
-
-@pytest.mark.parametrize(
-    ("good", "bad"),
-    [("runs-on:", "runs:"), ("    steps:", "    stages:"), ("fail-fast: false", "fail-fast: 3")],
-)
-def test_slips_are_found(tmp_path, good, bad):
+    # The program finds slips.
     text = WORKFLOW.read_text()
-    assert good in text
-    (tmp_path / "wheels.yml").write_text(text.replace(good, bad))
-    assert checked(tmp_path / "wheels.yml").returncode == 1
+    slips = {"runs-on:": "runs:", "    steps:": "    stages:", "fail-fast: false": "fail-fast: 3"}
+    for good, bad in slips.items():
+        assert good in text
+        (tmp_path / "wheels.yml").write_text(text.replace(good, bad))
+        assert checked(tmp_path / "wheels.yml").returncode == 1
 
 
 def test_it_builds_for_every_platform_with_the_compiler_that_the_workspace_needs():

@@ -1,13 +1,12 @@
 """The server of ``igsr view --web`` for tests, and requests to it."""
 
-from __future__ import annotations
-
 import contextlib
 import http.client
 import json
 import signal
 import socket
 import subprocess
+import sys
 import threading
 import urllib.request
 
@@ -16,9 +15,9 @@ from igsr.rendering.live_view import LiveView
 
 
 @contextlib.contextmanager
-def served(*paths, cameras=None):
+def served(*paths):
     """A server of paths, at a port that is free."""
-    with open_server(LiveView(paths, cameras), "127.0.0.1", 0) as server:
+    with open_server(LiveView(paths, None), "127.0.0.1", 0) as server:
         # It looks ten times as often as usual whether it shall end.
         thread = threading.Thread(target=server.serve_forever, args=(0.05,))
         thread.start()
@@ -48,26 +47,29 @@ def state_of(server):
     return json.loads(content)
 
 
-def view_until_ctrl_c(command, folder, variables):
-    """Start the browser view by a command, read its state, and stop it with Ctrl-C.
-
-    Returns:
-        The state, the exit status and stderr.
-    """
-    process = subprocess.Popen(
-        command,
+def started_view(folder, variables, *words):
+    """The process of ``igsr view``."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "igsr.cli", "view", *map(str, words)],
         cwd=folder,
         env=variables,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        # Children of a shell's background jobs ignore Ctrl-C.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
+
+
+def view_until_ctrl_c(*started):
+    """Start the browser view, read its state, and stop it; its address, state, status, stderr."""
+    process = started_view(*started)
     try:
         url = process.stdout.readline().strip()
-        with urllib.request.urlopen(f"{url}state", timeout=30) as answer:
+        here = url.replace("0.0.0.0", "127.0.0.1")
+        with urllib.request.urlopen(f"{here}state", timeout=30) as answer:
             state = json.load(answer)
     finally:
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate(timeout=30)
-    return state, process.returncode, errors
+    return url, state, process.returncode, errors

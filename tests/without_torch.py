@@ -1,11 +1,8 @@
 """Python processes in which torch is not installed, as after ``pip install igsr``."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 #: Packages of the extra ``refine``, and what comes with them.
 BLOCKED = ("torch", "torchmetrics", "torchvision")
@@ -23,7 +20,7 @@ sys.meta_path.insert(0, Blocked())
 """
 
 
-def environment(folder: Path) -> dict[str, str]:
+def environment(folder):
     """Variables of a process without torch; writes a file that blocks it into the folder."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "sitecustomize.py").write_text(SITE)
@@ -31,7 +28,7 @@ def environment(folder: Path) -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": path}
 
 
-def python(folder: Path, *arguments: object, **options) -> subprocess.CompletedProcess[str]:
+def python(folder, *arguments, **options):
     """Run Python without torch."""
     return subprocess.run(
         [sys.executable, *map(str, arguments)],
@@ -43,6 +40,6 @@ def python(folder: Path, *arguments: object, **options) -> subprocess.CompletedP
     )
 
 
-def igsr(folder: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
+def igsr(folder, *arguments):
     """Run an ``igsr`` command without torch, in the folder."""
     return python(folder, "-m", "igsr.cli", *arguments, cwd=folder)

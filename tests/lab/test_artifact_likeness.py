@@ -1,7 +1,5 @@
 """Similarity of the errors of two sets of renders."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -23,8 +21,7 @@ def renders(coarse, count=4, size=64, seed=0):
 @pytest.mark.parametrize(("frequency", "octave"), [(0.3, -1), (0.2, -2), (0.1, -3), (0.05, -4)])
 def test_a_wave_is_in_its_octave(frequency, octave):
     pairs = renders(1, count=1)
-    wave = np.rint(50 * np.sin(2 * np.pi * frequency * np.arange(64))).astype(np.int64)
-    pairs.inputs[0, :3] = 128 + wave[None, None, :]
+    pairs.inputs[0, :3] = np.rint(128 + 50 * np.sin(2 * np.pi * frequency * np.arange(64)))
     (row,) = signatures([pairs])
     shares = row[: len(OCTAVES)]
     assert np.sum(shares) == pytest.approx(1.0)

@@ -1,7 +1,5 @@
 """Baselines that studies compare igsr with."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scenes
@@ -17,12 +15,14 @@ def capture():
     return scenes.capture(views=8, size=40, alpha=True)
 
 
-def test_the_default_is_igsrs():
+def test_the_default_is_igsrs_and_unknown_presets_are_named():
     assert preset_keywords("default") == {}
     settings = preset_settings("default", 8, dropout=0.0, steps=None)
     expected = settings_for(8, dropout=0.0)
     assert settings["dropout"] == 0.0
     assert all(settings[name] == getattr(expected, name) for name in settings)
+    with pytest.raises(igsr.IgsrError, match=f"preset must be one of {', '.join(PRESETS)}"):
+        preset_keywords("best")
 
 
 @pytest.mark.parametrize("name", ["3dgs", "instantsplat"])
@@ -51,8 +51,3 @@ def test_instantsplat_keeps_the_number_of_splats_and_moves_cameras(capture):
     assert not np.array_equal(cameras[0].viewmat, capture.train_views[0].camera.viewmat)
     (focal,) = {camera.K[0, 0] for camera in cameras}
     assert focal != capture.train_views[0].camera.K[0, 0]
-
-
-def test_unknown_presets_are_named():
-    with pytest.raises(igsr.IgsrError, match=f"preset must be one of {', '.join(PRESETS)}"):
-        preset_keywords("best")

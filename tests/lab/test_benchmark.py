@@ -1,7 +1,5 @@
 """The benchmark: workloads, oracle, errors, rows, two builds, the command."""
 
-from __future__ import annotations
-
 import json
 import os
 import runpy
@@ -21,16 +19,7 @@ from PIL import Image
 from igsr import _core
 from igsr._internal import peak_memory
 from igsr.errors import IgsrError
-from igsr_lab.bench import (
-    accuracy,
-    fit_rows,
-    growth,
-    oracle,
-    run,
-    scenes,
-    stage_rows,
-    two_builds,
-)
+from igsr_lab.bench import accuracy, fit_rows, growth, oracle, run, scenes, stage_rows, two_builds
 from igsr_lab.bench.comparison import MIN_FLIP, gradient_error, picture_error, size_row
 from igsr_lab.bench.plots import plot_speed_vs_error
 from igsr_lab.bench.table import describe_machine, not_run_lines
@@ -285,7 +274,7 @@ def test_unknown_memory_is_left_out(monkeypatch, tmp_path, is_on_device):
 
 
 @pytest.mark.parametrize("error", [IgsrError("It ended early."), RuntimeError("The GPU is lost.")])
-def test_a_failed_point_has_a_row_with_the_reason(monkeypatch, error):
+def test_a_failure_has_a_row_with_the_reason_and_other_rows_survive(monkeypatch, tmp_path, error):
     def failing(*arguments):
         raise error
 
@@ -293,13 +282,6 @@ def test_a_failed_point_has_a_row_with_the_reason(monkeypatch, error):
     (row,) = growth.growth_rows("cpu", 0, [(10, 16)], 0.0)
     assert "ms" not in row
     assert str(error) in row["not_run"]
-
-
-@pytest.mark.parametrize("error", [IgsrError("It ended early."), RuntimeError("The GPU is lost.")])
-def test_rows_of_other_workloads_survive_a_failure(monkeypatch, tmp_path, error):
-    def failing(*arguments):
-        raise error
-
     monkeypatch.setattr(run, "growth_rows", lambda backend, seed, seconds: [{"ms": 1.0}])
     monkeypatch.setattr(run, "pair_rows", failing)
     monkeypatch.setattr(run, "rasterize_rows", lambda backend, seed, seconds: [{"ms": 2.0}])
@@ -359,8 +341,7 @@ def test_the_page_names_every_setting(tmp_path):
     errors = [row["setting_mean_error"] for row in report["rows"][::2]]
     assert errors[0] > errors[3] > 0
     assert errors[5] < errors[4]
-    with Image.open(tmp_path / accuracy.PLOT_NAME) as plot:
-        assert plot.width > 500
+    assert Image.open(tmp_path / accuracy.PLOT_NAME).width > 500
 
 
 def test_two_builds_take_turns(tmp_path):
@@ -387,23 +368,18 @@ def test_another_build_replaces_the_packages(tmp_path):
     assert "in use already" in done.stderr
 
 
-@pytest.mark.parametrize(
-    ("failing", "slower"),
-    [("old", []), ("new", ["W4 with 5 splats on cpu: the new build failed: ValueError: no."])],
-)
-def test_a_failing_build_has_a_row_with_the_reason(failing, slower):
-    answers = {build: {"fit step": [1.0, 2.0]} for build in ("old", "new")}
-    answers[failing] = {"failed": "ValueError: no"}
+def test_failing_and_slower_builds_are_named():
+    def build(answer):
+        return SimpleNamespace(ask=lambda *question: answer)
+
+    sound, failing = build({"fit step": [1.0, 2.0]}), build({"failed": "ValueError: no"})
     size = {"workload": "W4", "splats": 5, "backend": "cpu"}
-    old, new = (
-        SimpleNamespace(ask=lambda *question, build=build: answers[build]) for build in answers
-    )
-    rows = two_builds.pair_rows(size, old, new, "W4 5 8", 0.0, 2)
-    assert [row["not_run"] for row in rows] == [f"the {failing} build failed: ValueError: no"]
-    assert two_builds.slower_rows(rows, 10.0) == slower
+    for name, old, new in (("old", failing, sound), ("new", sound, failing)):
+        rows = two_builds.pair_rows(size, old, new, "W4 5 8", 0.0, 2)
+        assert [row["not_run"] for row in rows] == [f"the {name} build failed: ValueError: no"]
+        slower = [] if name == "old" else [f"W4 with 5 splats on cpu: {rows[0]['not_run']}."]
+        assert two_builds.slower_rows(rows, 10.0) == slower
 
-
-def test_slower_builds_are_named():
     size = {"splats": 5, "width": 8, "height": 8, "backend": "cpu", "workload": "W1"}
     rows = [{**size, "pass": name, "ratio": ratio} for name, ratio in (("a", 0.92), ("b", 0.8))]
     assert two_builds.slower_rows(rows, 10.0) == [
@@ -433,8 +409,7 @@ def test_bench_writes_machine_and_rows(lab_here, tmp_path):
     assert "--garden" in lines[0]
     assert "--capture" in lines[1]
     assert all(line in done.stdout for line in lines)
-    with Image.open(tmp_path / "plot.png") as plot:
-        assert plot.width > 500
+    assert Image.open(tmp_path / "plot.png").width > 500
 
 
 W3 = ["--workload", "W3"]
@@ -489,8 +464,7 @@ def test_growth_is_plotted(tmp_path, memory):
     ]
     report = {"machine": describe_machine(["cpu"], 0), "rows": rows}
     plot_speed_vs_error(tmp_path / "growth.png", report)
-    with Image.open(tmp_path / "growth.png") as plot:
-        assert plot.width > 500
+    assert Image.open(tmp_path / "growth.png").width > 500
 
 
 def test_the_peak_needs_a_valid_time():

@@ -1,7 +1,5 @@
 """``python -m igsr_lab pairs`` and ``train``, and ``igsr denoise`` with the trained weights."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

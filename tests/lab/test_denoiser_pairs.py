@@ -1,7 +1,5 @@
 """Pairs to train the denoiser with: renders, their photos, and files of them."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from dataclasses import replace
@@ -12,48 +10,29 @@ import scenes
 
 import igsr
 from igsr.capture import Camera, View
+from igsr.capture.types import intrinsic_matrix
 from igsr.denoiser.inputs import BUFFERS, CHANNELS, COLOR
 from igsr.evaluation.scores import BLACK
-from igsr_lab.denoiser import pairs
-from igsr_lab.denoiser.pair_files import (
-    OFFSET,
-    SCALE,
-    Pairs,
-    packed,
-    read_pairs,
-    rendered_pairs,
-    write_pairs,
-)
+from igsr_lab.denoiser import pair_files, pairs
+from igsr_lab.denoiser.pair_files import Pairs, packed, read_pairs, rendered_pairs, write_pairs
 from igsr_lab.denoiser.pairs import FITTED_RENDERED, make_pairs
 
 
-def camera(x=0.0, size=32, focal=40.0):
+def camera(x):
     """Looks along +z from (x, 0, -4)."""
     viewmat = np.eye(4)
     viewmat[:3, 3] = [-x, 0.0, 4.0]
-    K = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
-    return Camera(viewmat, K, size, size)
-
-
-def splats(means, scales, opacity=0.95, quats=(1.0, 0.0, 0.0, 0.0)):
-    means = np.asarray(means, np.float32)
-    n = len(means)
-    return igsr.Splats(
-        means=means,
-        quats=np.tile(np.asarray(quats, np.float32), (n, 1)),
-        scales=np.log(np.broadcast_to(np.asarray(scales, np.float32), (n, 3))),
-        opacities=np.full(n, np.log(opacity / (1 - opacity)), np.float32),
-        sh=np.full((n, 1, 3), 0.5, np.float32),
-    )
+    return Camera(viewmat, intrinsic_matrix(40.0, 40.0, 16.0, 16.0), 32, 32)
 
 
 def test_eight_bits_keep_what_counts(tmp_path):
     random = np.random.default_rng(0)
     inputs = random.uniform(-1, 2, (CHANNELS, 5, 6)).astype(np.float32)
-    narrow = SCALE < 0.01
+    scale, offset = (one[:, None, None] for one in (pair_files.SCALE, pair_files.OFFSET))
+    narrow = pair_files.SCALE < 0.01
     inputs[narrow] = np.clip(inputs[narrow], 0, 1)
     inputs[COLOR + 4] = 0.0
-    restored = packed(inputs) * SCALE[:, None, None] + OFFSET[:, None, None]
+    restored = packed(inputs) * scale + offset
     assert np.abs(restored - inputs)[narrow].max() <= 0.5001 / 255
     assert np.abs(restored - inputs).max() <= 1.5001 / 255
     assert np.abs(restored[COLOR + 4]).max() < 1e-6, "zero stays zero"
@@ -67,28 +46,29 @@ def test_eight_bits_keep_what_counts(tmp_path):
     assert np.array_equal(pairs.masks[0], mask)
     data = (tmp_path / "a.npz").read_bytes()
     (tmp_path / "torn.npz").write_bytes(data[: len(data) // 2])
-    with pytest.raises(igsr.IgsrError, match=r"torn\.npz is damaged"):
-        read_pairs(tmp_path / "torn.npz")
     with open(tmp_path / "array.npz", "wb") as file:
         np.save(file, truth)
-    with pytest.raises(igsr.IgsrError, match=r"array\.npz is damaged"):
-        read_pairs(tmp_path / "array.npz")
+    old = {"inputs": np.zeros((1, 4, 5, 6), np.uint8), "truth": truth[None], "masks": mask[None]}
+    np.savez(tmp_path / "old.npz", **old)
+    for name, message in (
+        ("torn", "is damaged"),
+        ("array", "is damaged"),
+        ("missing", "does not exist"),
+        ("old", "holds pairs of another version"),
+    ):
+        with pytest.raises(igsr.IgsrError, match=rf"{name}\.npz {message}"):
+            read_pairs(tmp_path / f"{name}.npz")
     for at in range(100, len(data) - 100, 7):
         (tmp_path / "flipped.npz").write_bytes(data[:at] + bytes([data[at] ^ 255]) + data[at + 1 :])
         try:
             read_pairs(tmp_path / "flipped.npz")
         except igsr.IgsrError as error:
             assert "flipped.npz" in str(error)
-    with pytest.raises(igsr.IgsrError, match=r"missing\.npz does not exist"):
-        read_pairs(tmp_path / "missing.npz")
-    old = {"inputs": np.zeros((1, 4, 5, 6), np.uint8), "truth": truth[None], "masks": mask[None]}
-    np.savez(tmp_path / "old.npz", **old)
-    with pytest.raises(igsr.IgsrError, match=r"old\.npz holds pairs of another version"):
-        read_pairs(tmp_path / "old.npz")
 
 
 def test_a_photo_is_not_looked_up_in_itself():
-    scene = splats([[0.0, 0.0, 0.0]], [2.0, 2.0, 0.01])
+    scene = scenes.round_splats([[0.0, 0.0, 0.0]], size=2.0, opacity=3.0)
+    scene.scales[:, 2] = np.log(0.01)
     views = []
     for k, x in enumerate((0.0, 0.4)):
         picture = igsr.render(scene, camera(x), backend="cpu").to_uint8()
@@ -108,15 +88,17 @@ def test_a_photo_is_not_looked_up_in_itself():
         rendered_pairs(scene, views, [views[0], other], BLACK, "cpu")
 
 
+OPTIONS = {"steps": 4, "backend": "cpu"}
+
+
 @pytest.mark.parametrize("recipe", ["sparse", "underfit", "noise", "leave-one-out"])
 def test_pairs_of_every_recipe_are_the_same_again_and_not_made_twice(tmp_path, recipe):
     made = scenes.capture(views=5, size=24)
     scenes.write_capture(tmp_path / "ball", made)
-    options = {"recipes": [recipe], "steps": 4, "views": 1, "backend": "cpu"}
+    options = {"recipes": [recipe], "views": 1, **OPTIONS}
     rows = make_pairs([tmp_path / "ball"], tmp_path / "a", **options)
-    again = make_pairs([tmp_path / "ball"], tmp_path / "b", **options)
     assert len(rows) == (5 if recipe == "leave-one-out" else 1)
-    assert rows == again
+    assert make_pairs([tmp_path / "ball"], tmp_path / "b", **options) == rows
     for row in rows:
         first, second = (read_pairs(tmp_path / out / row["pairs"]) for out in "ab")
         assert np.array_equal(first.inputs, second.inputs)
@@ -137,9 +119,8 @@ def test_what_is_held_out_is_not_trained_on(tmp_path, monkeypatch):
     folder = tmp_path / "ball"
     assert split.test_views
     held = {view.image.tobytes() for view in split.test_views}
-    options = {"steps": 4, "views": 9, "backend": "cpu"}
     for recipes in (["sparse", "paper"], ["leave-one-out"]):
-        rows = make_pairs([folder], tmp_path / "a", recipes=recipes, **options)
+        rows = make_pairs([folder], tmp_path / "a", recipes=recipes, views=9, **OPTIONS)
         for row in rows:
             truth = read_pairs(tmp_path / "a" / row["pairs"]).truth
             shown = {np.moveaxis(one, 0, -1).tobytes() for one in truth}
@@ -151,7 +132,7 @@ def test_what_is_held_out_is_not_trained_on(tmp_path, monkeypatch):
 
 
 def test_another_capture_of_the_same_name_is_not_taken_for_done(tmp_path):
-    options = {"recipes": ["sparse"], "steps": 4, "views": 1, "backend": "cpu"}
+    options = {"recipes": ["sparse"], "views": 1, **OPTIONS}
     rows = []
     for name, seed in (("a", 0), ("b", 1)):
         made = scenes.capture(views=5, size=24, scene=scenes.splats(seed=seed))
@@ -185,7 +166,7 @@ def test_after_noise_all_views_are_rendered_from_where_they_are(tmp_path, recipe
     monkeypatch.setattr(pairs, "PAPER_STEPS", 4)
     made = scenes.capture(views=6, size=24)
     scenes.write_capture(tmp_path / "ball", made)
-    options = {"recipes": [recipe], "steps": 4, "views": 9, "backend": "cpu", "all_views": True}
+    options = {"recipes": [recipe], "views": 9, "all_views": True, **OPTIONS}
     (row,) = make_pairs([tmp_path / "ball"], tmp_path / "out", **options)
     unseen = 6 - row["photos"] if recipe == "sparse" else 6
     assert row["renders"] == unseen + (0 if recipe == "paper" else FITTED_RENDERED)

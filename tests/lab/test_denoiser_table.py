@@ -1,7 +1,5 @@
 """Study ``denoiser_table``: renders of degraded fits before and after denoising."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
@@ -51,10 +49,20 @@ def pairs(path, hidden=0):
     return str(path)
 
 
-def test_a_denoiser_that_does_nothing_changes_no_score(tmp_path):
-    file = pairs(tmp_path / "pairs.npz")
-    before = run_cleaning("", Cleaning(file, None, None))
-    same = run_cleaning("", Cleaning(file, weights(tmp_path / "same.safetensors"), None))
+@pytest.fixture
+def scores(tmp_path):
+    """A function that scores pairs, and the same after a denoiser."""
+
+    def both(hidden=0, **denoiser):
+        file = pairs(tmp_path / "pairs.npz", hidden)
+        found = [None, weights(tmp_path / "a.safetensors", **denoiser)]
+        return [run_cleaning("", Cleaning(file, one, None)) for one in found]
+
+    return both
+
+
+def test_a_denoiser_that_does_nothing_changes_no_score(scores):
+    before, same = scores()
     assert before["psnr"] == pytest.approx(-10 * np.log10(np.square(20 / 255) / 2))
     assert before["best_quarter"] == 100.0
     assert before["perceptual"] is None
@@ -67,21 +75,13 @@ def test_a_denoiser_that_does_nothing_changes_no_score(tmp_path):
     assert sum(found["confidence"]) / sum(found["pixels"]) == pytest.approx(claimed, rel=1e-2)
 
 
-def test_the_best_quarter_shows_harm_to_good_pixels(tmp_path):
-    file = pairs(tmp_path / "pairs.npz")
+def test_the_best_quarter_shows_harm_to_good_pixels_and_hidden_ones_do_not_count(scores):
     # A confident denoiser makes all of its change: good pixels become 10 too bright.
-    brighter = weights(tmp_path / "brighter.safetensors", brighter=10.2 / 255, log_error=-7.0)
-    after = run_cleaning("", Cleaning(file, brighter, None))
+    _, brighter = scores(brighter=10.2 / 255, log_error=-7.0)
+    before, same = scores(hidden=24)
     for name in ("psnr", "best_quarter"):
-        assert after[name] == pytest.approx(-20 * np.log10(10 / 255), abs=0.05)
-
-
-def test_hidden_pixels_do_not_count(tmp_path):
-    file = pairs(tmp_path / "pairs.npz", hidden=24)
-    before = run_cleaning("", Cleaning(file, None, None))
-    for name in ("psnr", "best_quarter"):
+        assert brighter[name] == pytest.approx(-20 * np.log10(10 / 255), abs=0.05)
         assert before[name] == pytest.approx(-20 * np.log10(20 / 255))
-    same = run_cleaning("", Cleaning(file, weights(tmp_path / "same.safetensors"), None))
     assert sum(same["confidence"]["pixels"]) == 2 * 40 * 24
 
 
@@ -115,7 +115,12 @@ def test_photos_of_degraded_fits():
 
 
 @pytest.fixture
-def data(tmp_path):
+def data(tmp_path, monkeypatch):
+    """A folder of scenes whose fits are short."""
+    short = replace(presets.settings_for(8), steps=20, max_splats=200)
+    monkeypatch.setattr(presets, "_default", lambda *_: short)
+    monkeypatch.setattr(denoiser_study, "SHIPPED", tmp_path / "same.safetensors")
+    weights(tmp_path / "same.safetensors")
     scenes.write_capture(tmp_path / "data/ball", scenes.capture(views=6, size=24))
     scenes.write_capture(tmp_path / "data/more/cube", scenes.capture(views=6, size=24))
     (tmp_path / "data/empty").mkdir()
@@ -135,10 +140,6 @@ def test_images_of_a_capture_are_not_another_scene(data, tmp_path):
 def test_denoisers_are_compared_and_other_weights_are_scored_again(
     data, tmp_path, monkeypatch, lab_here
 ):
-    short = replace(presets.settings_for(8), steps=20, max_splats=200)
-    monkeypatch.setattr(presets, "_default", lambda *_: short)
-    monkeypatch.setattr(denoiser_study, "SHIPPED", tmp_path / "same.safetensors")
-    weights(tmp_path / "same.safetensors")
     dark = weights(tmp_path / "dark.safetensors", brighter=-0.2)
     command = ["study", "denoiser-table", data, "--out", tmp_path / "out", "--kind", "3"]
     command += ["--denoiser", f"dark={dark}", "--json", "--backend", "cpu"]
@@ -173,21 +174,18 @@ def test_denoisers_are_compared_and_other_weights_are_scored_again(
     assert changed["scenes"]["ball"]["after"] != ball["after"]
 
 
-def test_fits_of_other_photos_are_repeated(tmp_path, monkeypatch):
-    short = replace(presets.settings_for(8), steps=5, max_splats=50)
-    monkeypatch.setattr(presets, "_default", lambda *_: short)
+def test_fits_of_other_photos_are_repeated(data, tmp_path, monkeypatch):
     monkeypatch.setattr(degraded_fits, "PAPER_STEPS", 5)
-    made = scenes.capture(views=6, size=24)
-    scenes.write_capture(tmp_path / "data/ball", made)
-    study = Study(tmp_path / "data", tmp_path / "out", seeds=1)
-    kinds = ("3", "paper")
-    first = denoiser_table(study, kinds=kinds)
+    study = Study(data, tmp_path / "out", seeds=1)
+    options = {"scenes": ("ball",), "kinds": ("3", "paper")}
+    first = denoiser_table(study, **options)
     assert set(first["mean"]) == {"sparse", "paper"}
     assert first["protocol"]["kinds"]["paper"] == "at most 20 photos, raw-affine 0.01, 5 steps"
+    made = scenes.capture(views=6, size=24)
     darker = [replace(view, image=view.image // 2) for view in made.views]
-    scenes.write_capture(tmp_path / "data/ball", replace(made, views=darker))
-    second = denoiser_table(study, kinds=kinds)
-    other = denoiser_table(replace(study, out=tmp_path / "other"), kinds=kinds)
+    scenes.write_capture(data / "ball", replace(made, views=darker))
+    second = denoiser_table(study, **options)
+    other = denoiser_table(replace(study, out=tmp_path / "other"), **options)
     ball = [report["scenes"]["ball"] for report in (first, second, other)]
     assert ball[1] == ball[2] != ball[0]
 
@@ -206,11 +204,7 @@ def test_fits_of_other_photos_are_repeated(tmp_path, monkeypatch):
         ({"scenes": ("more/cube", "more-cube")}, "more/cube and more-cube would have one name"),
     ],
 )
-def test_bad_arguments_are_refused_before_the_first_fit(
-    data, tmp_path, monkeypatch, options, message
-):
-    weights(tmp_path / "same.safetensors")
-    monkeypatch.setattr(denoiser_study, "SHIPPED", tmp_path / "same.safetensors")
+def test_bad_arguments_are_refused_before_the_first_fit(data, tmp_path, options, message):
     paths = {name: tmp_path / value for name, value in options.items() if name == "pairs"}
     with pytest.raises(igsr.IgsrError, match=message):
         denoiser_table(Study(data, tmp_path / "out"), **{**options, **paths})

@@ -17,25 +17,11 @@ from igsr.denoiser import load_network, save_network
 from igsr.denoiser.architecture import Architecture
 from igsr.denoiser.inputs import CHANNELS, COLOR
 from igsr.denoiser.network import DenoiserNetwork
+from igsr_lab.denoiser import losses, pair_files
 from igsr_lab.denoiser.crops import MIN_ERROR, draw_batch
 from igsr_lab.denoiser.learner import Processes
-from igsr_lab.denoiser.losses import (
-    LOSSES,
-    Loss,
-    Prediction,
-    error_likelihood,
-    perceptual_ratio,
-    regret,
-    squared_ratio,
-    structure_ratio,
-)
-from igsr_lab.denoiser.pair_files import (
-    Pairs,
-    capture_of_pairs,
-    read_pairs,
-    validation_count,
-    write_pairs,
-)
+from igsr_lab.denoiser.losses import LOSSES, Loss, Prediction
+from igsr_lab.denoiser.pair_files import Pairs, read_pairs, write_pairs
 from igsr_lab.denoiser.perceptual_distance import SqueezeNetDistance, _Lpips, lpips_distance
 from igsr_lab.denoiser.train_network import CHECKPOINT, LOG, WEIGHTS, plot_training, train
 from igsr_lab.denoiser.training_settings import Training
@@ -71,20 +57,23 @@ def equal_weights(first, second):
 def test_regret_counts_only_errors_that_grow():
     truth = torch.full((1, 3, 2, 2), 0.5)
     render = truth + 0.1
-    assert regret(prediction(truth + 0.05, truth, render)) == 0.0
-    assert regret(prediction(truth - 0.3, truth, render)).item() == pytest.approx(0.2)
+    assert losses.regret(prediction(truth + 0.05, truth, render)) == 0.0
+    assert losses.regret(prediction(truth - 0.3, truth, render)).item() == pytest.approx(0.2)
 
 
 def test_a_decibel_counts_the_same_in_good_and_bad_pictures():
     truth = torch.full((2, 3, 8, 8), 0.5)
     off = torch.tensor([0.3, 0.1]).reshape(2, 1, 1, 1)
     gained = 10.0 ** (-1.0 / 20.0)
-    both = squared_ratio(prediction(truth + gained * off, truth, truth + off))
-    assert both.item() == pytest.approx(-0.23, abs=0.003)
-    bad = squared_ratio(prediction(truth[:1] + gained * 0.3, truth[:1], truth[:1] + 0.3))
-    assert bad.item() == pytest.approx(both.item(), rel=0.02)
-    invisible = squared_ratio(prediction(truth + 1e-3, truth, truth))
-    assert 0.0 < invisible.item() < 0.02
+
+    def ratio(image, truth, render):
+        return losses.squared_ratio(prediction(image, truth, render)).item()
+
+    both = ratio(truth + gained * off, truth, truth + off)
+    assert both == pytest.approx(-0.23, abs=0.003)
+    bad = ratio(truth[:1] + gained * 0.3, truth[:1], truth[:1] + 0.3)
+    assert bad == pytest.approx(both, rel=0.02)
+    assert 0.0 < ratio(truth + 1e-3, truth, truth) < 0.02
 
 
 def test_smoothing_costs_structure():
@@ -92,16 +81,14 @@ def test_smoothing_costs_structure():
     truth = torch.rand(2, 3, 24, 24, generator=random)
     render = (truth + 0.2 * torch.randn(truth.shape, generator=random)).clamp(0.0, 1.0)
     blurred = torch.nn.functional.avg_pool2d(render, 3, 1, 1)
-    nearer = 0.5 * (render + truth)
-    same, better, smooth = (
-        structure_ratio(prediction(image, truth, render)).item()
-        for image in (render, nearer, blurred)
-    )
-    assert same == 0.0
-    assert better < -0.5
-    assert smooth > 0.1
-    small = truth[..., :8, :8]
-    assert structure_ratio(prediction(small, small, small)).item() == 0.0
+
+    def ratio(image, truth=truth, render=render):
+        return losses.structure_ratio(prediction(image, truth, render)).item()
+
+    assert ratio(render) == 0.0
+    assert ratio(0.5 * (render + truth)) < -0.5
+    assert ratio(blurred) > 0.1
+    assert ratio(*[truth[..., :8, :8]] * 3) == 0.0
 
 
 def test_the_perceptual_ratio_uses_some_pictures_of_a_batch():
@@ -110,7 +97,8 @@ def test_the_perceptual_ratio_uses_some_pictures_of_a_batch():
     image[:2] += 0.1
     image[2:] += 10.0
     image.requires_grad_()
-    value = perceptual_ratio(Prediction(truth + 0.2, image, image[:, :1], truth), mean_distance)
+    given = Prediction(truth + 0.2, image, image[:, :1], truth)
+    value = losses.perceptual_ratio(given, mean_distance)
     assert value.item() == pytest.approx(np.log(0.11 / 0.21), rel=1e-4)
     value.backward()
     assert image.grad[:2].abs().sum() > 0.0
@@ -121,12 +109,12 @@ def test_the_likelihood_is_best_at_the_true_error_and_does_not_reach_the_picture
     truth = torch.zeros(1, 3, 4, 4)
     image = torch.full_like(truth, 0.1, requires_grad=True)
     values = {
-        log: error_likelihood(prediction(image, truth, log_error=log)).item()
+        log: losses.error_likelihood(prediction(image, truth, log_error=log)).item()
         for log in (-4.0, float(np.log(0.1)), -1.0)
     }
     assert min(values, key=values.get) == float(np.log(0.1))
     log_error = torch.full((1, 1, 4, 4), -3.0, requires_grad=True)
-    error_likelihood(Prediction(truth, image, log_error, truth)).backward()
+    losses.error_likelihood(Prediction(truth, image, log_error, truth)).backward()
     assert image.grad is None
     assert log_error.grad.abs().sum() > 0.0
 
@@ -157,10 +145,7 @@ def test_every_loss_has_its_parts_and_gradients(name):
 def test_the_discriminator_sees_clamped_colors():
     torch.manual_seed(0)
     loss, render = Loss("gan", None), torch.full((1, 3, 32, 32), 0.5)
-    bright = [
-        Prediction(render, torch.full_like(render, value), torch.zeros(1, 1, 32, 32), render)
-        for value in (1.0, 3.0)
-    ]
+    bright = [prediction(torch.full_like(render, value), render, render) for value in (1.0, 3.0)]
     values = [(loss(one)[1]["gan"], loss.discriminator.loss(one).item()) for one in bright]
     assert values[0] == values[1]
 
@@ -182,7 +167,7 @@ def test_invalid_settings_are_refused(make, message):
         make()
 
 
-def pair_files(folder, count=3, size=40):
+def made_pairs(folder, count=3, size=40):
     """Smooth photos, and renders with coarse noise."""
     random = np.random.default_rng(0)
     paths = []
@@ -204,7 +189,7 @@ def log_of(out):
 
 def test_training_improves_validation_and_has_ten_checkpoints(tmp_path):
     training = replace(TINY, steps=150)
-    pairs = pair_files(tmp_path / "pairs")
+    pairs = made_pairs(tmp_path / "pairs")
     train(pairs, tmp_path, training, Architecture(8, (1, 1, 1)), log_every=50)
     rows = log_of(tmp_path)
     assert [row["step"] for row in rows] == sorted({*range(15, 151, 15), 50, 100})
@@ -215,7 +200,7 @@ def test_training_improves_validation_and_has_ten_checkpoints(tmp_path):
 
 @pytest.mark.parametrize("loss", ["default", "gan"])
 def test_a_resumed_training_ends_with_the_same_weights(tmp_path, loss):
-    pairs = pair_files(tmp_path / "pairs")
+    pairs = made_pairs(tmp_path / "pairs")
     training = replace(TINY, steps=12, loss=loss, dropout=0.2)
     every = {"log_every": 4, "checkpoint_every": 4}
 
@@ -244,7 +229,7 @@ def test_a_resumed_training_ends_with_the_same_weights(tmp_path, loss):
     train(pairs, out, training, SMALL, **every, resume=True)
     assert [row["step"] for row in log_of(out)] == [4, 8, 12]
 
-    darker = pair_files(tmp_path / "darker")
+    darker = made_pairs(tmp_path / "darker")
     content = read_pairs(darker[0])
     write_pairs(darker[0], replace(content, truth=content.truth // 2))
     for files, settings, distance in (
@@ -262,7 +247,7 @@ def test_a_resumed_training_ends_with_the_same_weights(tmp_path, loss):
 def test_hidden_pixels_do_not_influence_training(tmp_path):
     weights = []
     for name, hidden_truth in (("a", 0), ("b", 255)):
-        files = pair_files(tmp_path / name, count=2)
+        files = made_pairs(tmp_path / name, count=2)
         for path in files:
             pairs = read_pairs(path)
             pairs.masks[:, :20] = False
@@ -280,7 +265,7 @@ def test_hidden_pixels_do_not_influence_training(tmp_path):
 
 
 def test_training_can_start_from_weights(tmp_path):
-    pairs, start = pair_files(tmp_path / "pairs", count=2), tmp_path / "start.safetensors"
+    pairs, start = made_pairs(tmp_path / "pairs", count=2), tmp_path / "start.safetensors"
     save_network(random_network(seed=3), start, {})
     slow = replace(TINY, steps=1, rate=1e-9, weight_decay=0.0)
     trained = train(pairs, tmp_path / "out", slow, SMALL, start=start)
@@ -291,7 +276,7 @@ def test_training_can_start_from_weights(tmp_path):
 
 
 def test_crops_without_errors_are_drawn_again(tmp_path):
-    (path, _) = pair_files(tmp_path, count=2)
+    (path, _) = made_pairs(tmp_path, count=2)
     made = read_pairs(path)
     inputs = made.inputs.copy()
     inputs[0, :COLOR] = made.truth[0]  # one of the two views has no errors
@@ -304,19 +289,19 @@ def test_crops_without_errors_are_drawn_again(tmp_path):
 
 def test_no_capture_is_in_both_sets(tmp_path):
     def kept(*names):
-        return validation_count([f"{name}-seed0-cpu.npz" for name in names])
+        return pair_files.validation_count([f"{name}-seed0-cpu.npz" for name in names])
 
     assert kept("a-noise-0", "a-sparse-0", "b-noise-0", "b-sparse-0") == 2
     assert kept(*(f"{c}-sparse-0" for c in "abcdefghijklmnopqrst")) == 2
     assert kept("a-b-sparse-0", "a-sparse-0", "a-sparse-1", "a-sparse-2") == 3
     with pytest.warns(UserWarning, match="validation uses the scene that is trained on"):
         assert kept("a-leave-one-out-0", "a-leave-one-out-1", "a-leave-one-out-2") == 1
-    assert capture_of_pairs("k.1-leave-one-out-3-seed0-cpu.npz") == "k.1"
-    assert capture_of_pairs("mine.npz") == "mine.npz"
+    assert pair_files.capture_of_pairs("k.1-leave-one-out-3-seed0-cpu.npz") == "k.1"
+    assert pair_files.capture_of_pairs("mine.npz") == "mine.npz"
 
     # The name of one capture begins with that of another.
     names = ("a-noise-0", "a-p2-noise-0", "a-p2-sparse-0", "a-sparse-0", "a-sparse-1")
-    files = zip(pair_files(tmp_path / "all", count=5), names, strict=True)
+    files = zip(made_pairs(tmp_path / "all", count=5), names, strict=True)
     named = [path.rename(tmp_path / f"{name}-seed0-cpu.npz") for path, name in files]
     train(named, tmp_path / "out", replace(TINY, steps=1), SMALL)
     about = torch.load(tmp_path / "out" / CHECKPOINT, weights_only=True)["about"]
@@ -347,7 +332,7 @@ Path(folder, os.environ['RANK']).write_text(repr(seen))
 
 
 def test_processes_train_one_network_and_one_discriminator(tmp_path):
-    pair_files(tmp_path / "pairs")
+    made_pairs(tmp_path / "pairs")
     (tmp_path / "learn.py").write_text(SEVERAL)
     started = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node"]
     done = subprocess.run(
@@ -361,24 +346,19 @@ def test_processes_train_one_network_and_one_discriminator(tmp_path):
     assert [row["step"] for row in log_of(tmp_path / "out")] == [1, 2, 3]
 
 
-def test_a_batch_is_divided_evenly(tmp_path, monkeypatch):
+def test_bad_arguments_are_refused(tmp_path, monkeypatch):
+    pairs = made_pairs(tmp_path, 2)
+    for count, options, message in (
+        (1, {}, "at least two files of pairs"),
+        (2, {"log_every": 0}, "must be at least 1"),
+        (2, {"checkpoint_every": 0}, "must be at least 1"),
+    ):
+        with pytest.raises(igsr.IgsrError, match=message):
+            train(pairs[:count], tmp_path / "out", TINY, SMALL, **options)
     monkeypatch.setenv("WORLD_SIZE", "3")
     monkeypatch.setattr("torch.distributed.init_process_group", lambda backend: None)
     with pytest.raises(igsr.IgsrError, match="batch must be a multiple of the number of proc"):
         Processes("cpu").share_of(4)
-
-
-@pytest.mark.parametrize(
-    ("count", "options", "message"),
-    [
-        (1, {}, "at least two files of pairs"),
-        (2, {"log_every": 0}, "must be at least 1"),
-        (2, {"checkpoint_every": 0}, "must be at least 1"),
-    ],
-)
-def test_bad_arguments_are_refused(tmp_path, count, options, message):
-    with pytest.raises(igsr.IgsrError, match=message):
-        train(pair_files(tmp_path, count), tmp_path / "out", TINY, SMALL, **options)
 
 
 def test_lpips_gets_pictures_from_minus_one_to_one():

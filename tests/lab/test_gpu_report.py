@@ -1,7 +1,5 @@
 """``python -m igsr_lab bench --report`` and ``gpu-check``: the page about a GPU and its figures."""
 
-from __future__ import annotations
-
 import json
 import sys
 import time
@@ -38,8 +36,7 @@ def report_of(tmp_path, workload, tests=None):
     return path.read_text(), json.loads(path.with_suffix(".json").read_text())
 
 
-@pytest.mark.usefixtures("small")
-def test_the_page_has_the_device_times_errors_and_failed_tests(tmp_path):
+def test_the_page_has_the_device_times_errors_and_failed_tests(small, tmp_path):
     tests = {"command": "cargo", "passed": 3, "failed": ["a_test"], "seconds": 1.0, "error": "<b>"}
     page, figures = report_of(tmp_path, "W2", tests)
     assert all(words in page for words in ("1 failed", "a_test", "&lt;b&gt;"))
@@ -67,8 +64,7 @@ def test_the_page_has_the_device_times_errors_and_failed_tests(tmp_path):
         assert f"ball on gsplat not run: {gsplat_rows.why_not()}" in page
 
 
-@pytest.mark.usefixtures("small")
-def test_a_software_driver_has_a_small_w4(monkeypatch, tmp_path):
+def test_a_software_driver_has_a_small_w4(small, monkeypatch, tmp_path):
     ran = []
 
     def rows(backend, seed, grid=None, seconds=0.0, name="W4"):
@@ -96,7 +92,7 @@ def test_a_failing_viewer_is_one_message(monkeypatch):
         viewer_rows.viewer_rows((64, 48), 0, True)
 
 
-def test_the_page_has_the_reason_for_no_device(monkeypatch, tmp_path):
+def test_the_page_has_the_reason_for_no_device_and_ends_in_html(monkeypatch, tmp_path):
     why = "backend gpu: no adapter answers"
 
     def fails():
@@ -109,9 +105,6 @@ def test_the_page_has_the_reason_for_no_device(monkeypatch, tmp_path):
     path = tmp_path / "report.html"
     benchmark.write_device_report(path, {"device": device, "machine": machine, "rows": []})
     assert why in path.read_text()
-
-
-def test_a_report_ends_in_html(tmp_path):
     with pytest.raises(IgsrError, match=r"ends in \.html"):
         benchmark.json_beside(tmp_path / "report.json")
 
@@ -149,17 +142,11 @@ def test_failed_tests_are_named():
     assert "no device" in found["error"]
 
 
-def fake_gsplat(draws):
-    module = types.ModuleType("gsplat")
-    module.__version__ = "0"
-    module.rasterization = draws
-    return module
-
-
 def test_gsplat_gets_the_scene_and_its_rows_have_errors(monkeypatch):
-    monkeypatch.setitem(sys.modules, "gsplat", fake_gsplat(igsr.rasterization))
-    scene = shot_of(0, 30, 16).scene
-    picture, gradients = gsplat_rows.gsplat_rows("ball", scene, upstream(0, 16, 16), 0.0, "cpu")
+    gsplat = types.SimpleNamespace(__version__="0", rasterization=igsr.rasterization)
+    monkeypatch.setitem(sys.modules, "gsplat", gsplat)
+    arguments = ("ball", shot_of(0, 30, 16).scene, upstream(0, 16, 16), 0.0, "cpu")
+    picture, gradients = gsplat_rows.gsplat_rows(*arguments)
     for row, kind in ((picture, "forward"), (gradients, "backward")):
         assert (row["pass"], row["backend"]) == (kind, "gsplat")
         assert row["ms"] > 0.0
@@ -169,11 +156,9 @@ def test_gsplat_gets_the_scene_and_its_rows_have_errors(monkeypatch):
     assert 0.0 < gradients["max_error"] < 1e-4
     assert gradients["worst"].startswith("v_")
 
-
-def test_a_failing_gsplat_is_one_message(monkeypatch):
     def fails(**given):
         raise TypeError("unexpected keyword")
 
-    monkeypatch.setitem(sys.modules, "gsplat", fake_gsplat(fails))
+    gsplat.rasterization = fails
     with pytest.raises(IgsrError, match="gsplat 0 failed: unexpected keyword"):
-        gsplat_rows.gsplat_rows("ball", shot_of(0, 30, 16).scene, upstream(0, 16, 16), 0.0, "cpu")
+        gsplat_rows.gsplat_rows(*arguments)

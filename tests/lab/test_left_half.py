@@ -1,7 +1,5 @@
 """The left-half protocol: exposure from the left half, scores of the right half."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Noise on camera poses has the size that it names, and changes photos as it changes cameras."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

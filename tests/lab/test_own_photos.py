@@ -1,7 +1,5 @@
 """Study ``own_photos``: folders of photos from cameras to scores, kept runs, differences."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
@@ -105,13 +103,6 @@ def test_folders_of_photos_are_fitted_and_scored(calls, data, tmp_path):
     assert seen[-1]["fit_size"] == seen[-1]["score_size"] == [30, 30]
 
 
-def test_photos_are_scored_at_one_size(calls, data, tmp_path):
-    study = Study(data, tmp_path / "out", seeds=1)
-    report = own_photos(study, scenes=("ball",), max_size=20, score_size=32, **QUICK)
-    (row,) = report["runs"]
-    assert (row["fit_size"], row["score_size"]) == ([20, 20], [32, 32])
-
-
 def test_known_cameras_are_used_only_if_asked_for(calls, made, tmp_path):
     views = [
         replace(view, name=view.name.replace("photos/", "images/"), split="train")
@@ -128,16 +119,17 @@ def test_known_cameras_are_used_only_if_asked_for(calls, made, tmp_path):
     assert row["placed"] == 7
 
 
-def test_fitted_photos_are_scored_with_moved_cameras(calls, data, tmp_path):
+def test_photos_are_scored_at_one_size_and_fitted_ones_with_moved_cameras(calls, data, tmp_path):
     study = Study(data, tmp_path / "out", seeds=1)
-    options = {"preset": "instantsplat", "score_size": 30, **QUICK, "steps": 60}
+    options = {"preset": "instantsplat", "max_size": 20, "score_size": 30, **QUICK, "steps": 60}
     (row,) = own_photos(study, scenes=("ball",), **options)["runs"]
+    assert (row["fit_size"], row["score_size"]) == ([20, 20], [30, 30])
     assert row["train_psnr"] > row["psnr"]
 
 
 def row(scene, preset, seed, values, **more):
     views = [{"name": str(k), "psnr": value, "ms_ssim": None} for k, value in enumerate(values)]
-    whole = {"train_psnr": 1.0, "train_ssim": 1.0, "splats": 10, "seconds": 1.0, "cpu_seconds": 1.0}
+    whole = dict.fromkeys(("train_psnr", "train_ssim", "splats", "seconds", "cpu_seconds"), 10.0)
     return {"scene": scene, "preset": preset, "seed": seed, "views": views, **whole, **more}
 
 
@@ -190,15 +182,11 @@ def test_folders_with_photos_are_scenes(data, tmp_path):
         ({"features": "missing.npz"}, "missing.npz"),
     ],
 )
-def test_bad_arguments_are_refused_before_cameras_are_searched(
-    calls, data, tmp_path, options, message
-):
+def test_bad_arguments_are_refused_before_cameras_are_sought(calls, data, options, message):
     with pytest.raises(igsr.IgsrError, match=message):
-        own_photos(Study(data, tmp_path / "out"), **options)
-    assert calls == []
-
-
-def test_a_study_does_not_write_into_a_scene(calls, data):
+        own_photos(Study(data, data.parent / "out"), **options)
+    # A study does not write into a scene.
     with pytest.raises(igsr.IgsrError, match="name another --out"):
         own_photos(Study(data / "few", data / "few/out"), **QUICK)
     assert not (data / "few/out").exists()
+    assert calls == []

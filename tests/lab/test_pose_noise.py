@@ -1,7 +1,5 @@
 """Study ``pose_noise``: fits with noise on their cameras."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
@@ -35,8 +33,8 @@ def fake_row(data, fit):
         for way, more in (("raw", -1.0), ("aligned", 0.0), ("refined", 0.5 * fit.seed))
     }
     errors = {
-        "before": dict.fromkeys(noisy_poses.ERRORS, 0.6),
-        "after": dict.fromkeys(noisy_poses.ERRORS, 0.1),
+        when: dict.fromkeys(noisy_poses.ERRORS, by)
+        for when, by in (("before", 0.6), ("after", 0.1))
     }
     rest = {"splats": 10, "seconds": 1.0, "protocol": {"views": 2}}
     return {**vars(fit), "noise": str(fit.noise), **errors, **rest, **scores}
@@ -69,17 +67,14 @@ def test_a_scene_with_noise_is_fitted_and_scored(data, monkeypatch):
     assert row["refined"]["psnr"] > 10.0
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
+def test_bad_arguments_are_refused(data, tmp_path):
+    for options, message in (
         ({"noise": -1.0}, "noise and turns"),
         ({"turns": (float("nan"),)}, "noise and turns"),
         ({"scenes": ("nothing",)}, "holds no transforms_train.json"),
-    ],
-)
-def test_bad_arguments_are_refused(data, tmp_path, options, message):
-    with pytest.raises(igsr.IgsrError, match=message):
-        pose_noise(Study(data, tmp_path), **{"scenes": ("ball",), **options})
+    ):
+        with pytest.raises(igsr.IgsrError, match=message):
+            pose_noise(Study(data, tmp_path), **{"scenes": ("ball",), **options})
 
 
 @pytest.mark.parametrize(

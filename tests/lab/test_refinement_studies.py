@@ -1,7 +1,5 @@
 """Studies of the refinement: table2, table3, sweep, photographs, refinement-ablation."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace
@@ -21,13 +19,7 @@ from igsr.refinement.novel_views import NovelView
 from igsr.refinement.selection import Candidate
 from igsr_lab import study
 from igsr_lab.study import Study, refinement_methods
-from igsr_lab.study.refinement_methods import (
-    METHODS,
-    OURS,
-    Method,
-    refine_keywords,
-    select_by_true_picture,
-)
+from igsr_lab.study.refinement_methods import METHODS, OURS, Method, select_by_true_picture
 from igsr_lab.study.refinement_report import mean_gains, paired_gains
 from igsr_lab.study.refinement_runs import RefinementRun, split
 from igsr_lab.study.splits import localized, scattered
@@ -127,9 +119,14 @@ def test_other_settings_remove_the_files_of_a_run_and_pictures_may_be_missing(da
         assert study.table3(study_in(data), **options) == report
 
 
-def brightness_distance(_, first, second):
-    """A distance for which the right choice is known."""
-    return abs(float(first.mean()) - float(second.mean()))
+@pytest.fixture
+def pixel_distance(monkeypatch):
+    """A distance of pictures for which the right choice is known."""
+
+    def distance(_, first, second):
+        return float(np.abs(first.astype(float) - second).mean())
+
+    monkeypatch.setattr(refinement_methods, "picture_distance", distance)
 
 
 def candidate(view, render, denoised):
@@ -140,8 +137,7 @@ def candidate(view, render, denoised):
 @pytest.mark.parametrize(
     ("name", "best"), [("absolute", 0), ("improvement", 1), ("absolute-before", 2)]
 )
-def test_the_papers_methods_select_by_the_true_picture(monkeypatch, name, best):
-    monkeypatch.setattr(refinement_methods, "picture_distance", brightness_distance)
+def test_the_papers_methods_select_by_the_true_picture(pixel_distance, name, best):
     views = ball(3, alpha=False).views
     # Errors before and after denoising.
     errors = [(30, 2), (60, 10), (20, 20)]
@@ -154,12 +150,7 @@ def test_the_papers_methods_select_by_the_true_picture(monkeypatch, name, best):
     assert selected is found[best]
 
 
-def test_the_papers_methods_ignore_masked_pixels(monkeypatch):
-    monkeypatch.setattr(
-        refinement_methods,
-        "picture_distance",
-        lambda _, first, second: float(np.abs(first.astype(float) - second).mean()),
-    )
+def test_the_papers_methods_ignore_masked_pixels(pixel_distance):
     made = ball(8, alpha=False)
     shown = np.zeros((40, 40), np.bool_)
     shown[:, 20:] = True
@@ -180,8 +171,8 @@ def test_the_papers_methods_ignore_masked_pixels(monkeypatch):
 def test_the_papers_methods_add_each_view_once():
     made = ball(3)
     method = Method("one", "absolute", 1, 2, cross_validate=False)
-    propose = refine_keywords(method, None, made, made.views, brightness_distance)["propose"]
-    proposed = propose(BALL, [made.views[0].camera], 24, "cpu")
+    given = refinement_methods.refine_keywords(method, None, made, made.views, lambda *_: 0.0)
+    proposed = given["propose"](BALL, [made.views[0].camera], 24, "cpu")
     assert [novel.camera for novel in proposed] == [view.camera for view in made.views[1:]]
 
 

@@ -1,7 +1,5 @@
 """Runs that are kept one by one, and repeated if anything that they depend on changed."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

@@ -13,19 +13,12 @@ from ray_stand_in import stand_in_ray
 
 from igsr import IgsrError
 from igsr.capture import load_capture
-from igsr_lab.synth import CaptureSettings, captures, synthesize
+from igsr_lab.synth import CaptureSettings, captures, mitsuba_scene, synthesize
 from igsr_lab.synth.cameras import Viewpoint, draw_rig, look_at
 from igsr_lab.synth.description import Description, Material, Part
 from igsr_lab.synth.materials import Materials
 from igsr_lab.synth.meshes import place, sheet, superquadric
-from igsr_lab.synth.mitsuba_scene import (
-    camera_error,
-    encode,
-    first_hits,
-    load_scene,
-    one_threaded_mitsuba,
-    take_photo,
-)
+from igsr_lab.synth.mitsuba_scene import load_scene, one_threaded_mitsuba
 from igsr_lab.synth.objects import OBJECTS, random_object
 from igsr_lab.synth.parts import bounds
 from igsr_lab.synth.skies import SKIES, UNSEEN_SKIES
@@ -44,6 +37,13 @@ def made(tmp_path_factory):
     for first in (LONE, AROUND):
         synthesize(folder, 1, first=first, settings=SMALL)
     return folder
+
+
+@pytest.fixture
+def lone(made, tmp_path):
+    """A folder with the lone object."""
+    shutil.copytree(scene(made, LONE), scene(tmp_path, LONE))
+    return tmp_path
 
 
 @pytest.fixture
@@ -92,7 +92,7 @@ def test_captures_load_with_the_written_cameras(made):
             assert view.image[..., :3].std() > 5
 
 
-def test_masks_and_depths_agree_with_alpha(made):
+def test_masks_and_depths_agree_with_alpha_and_show_only_the_objects(made):
     for view, mask, depth in masks_and_depths(scene(made, LONE)):
         alpha = view.image[..., 3]
         assert (mask == alpha).all()
@@ -103,8 +103,7 @@ def test_masks_and_depths_agree_with_alpha(made):
         assert (alpha == 0).any()
         assert (alpha == 255).any()
 
-
-def test_masks_of_surroundings_show_only_the_objects(made):
+    # With surroundings, the photo has no alpha.
     for _, mask, depth in masks_and_depths(scene(made, AROUND)):
         assert set(np.unique(mask)) == {0, 255}
         assert np.isfinite(depth[mask == 255]).all()
@@ -125,23 +124,22 @@ def test_parallel_scenes_have_the_same_bits(made, tmp_path):
     assert files(scene(tmp_path, LONE)) != files(scene(tmp_path, OTHER))
 
 
-def test_finished_scenes_are_kept_and_unfinished_ones_removed(made, tmp_path):
-    shutil.copytree(scene(made, LONE), scene(tmp_path, LONE))
-    before = files(tmp_path)
+def test_finished_scenes_are_kept_and_unfinished_ones_removed(lone):
+    before = files(lone)
     # As left by a killed process.
-    unfinished = tmp_path / f".scene_{OTHER:05d}.{2**30}.unfinished"
+    unfinished = lone / f".scene_{OTHER:05d}.{2**30}.unfinished"
     (unfinished / "train").mkdir(parents=True)
     (unfinished / "train" / "099.png").write_bytes(b"half")
     seen = []
     report = synthesize(
-        tmp_path, 2, first=OTHER, settings=SMALL, on_scene=lambda *args: seen.append(args[2])
+        lone, 2, first=OTHER, settings=SMALL, on_scene=lambda *row: seen.append(row)
     )
-    assert [row["name"] for row in seen] == [f"scene_{OTHER:05d}"]
+    assert [row["name"] for _, _, row in seen] == [f"scene_{OTHER:05d}"]
     assert [row["seconds"] is None for row in report["scenes"]] == [False, True]
     assert not unfinished.exists()
-    assert "train/002.png" in files(scene(tmp_path, OTHER))
-    assert "train/099.png" not in files(scene(tmp_path, OTHER))
-    assert before.items() <= files(tmp_path).items()
+    assert "train/002.png" in files(scene(lone, OTHER))
+    assert "train/099.png" not in files(scene(lone, OTHER))
+    assert before.items() <= files(lone).items()
 
 
 def test_scenes_made_on_ray_are_the_same(made, tmp_path, monkeypatch):
@@ -198,6 +196,10 @@ def ball_on_plane():
     )
 
 
+def photo(*given):
+    return mitsuba_scene.encode(mitsuba_scene.take_photo(*given)).astype(float)
+
+
 def test_lamps_are_rendered_at_their_projections():
     lamps = np.array([[0.3, 0.0, 0.2], [-0.2, 0.3, 0.0], [0.0, -0.3, -0.2]])
     viewpoints = [
@@ -205,7 +207,7 @@ def test_lamps_are_rendered_at_their_projections():
         Viewpoint(look_at(np.array([-1.0, -2.0, 0.3]), np.zeros(3), -0.1), 0.9, 48, 64),
     ]
     with one_threaded_mitsuba():
-        assert camera_error(viewpoints, lamps, 0.03) < 0.05
+        assert mitsuba_scene.camera_error(viewpoints, lamps, 0.03) < 0.05
 
 
 def test_few_light_paths_are_denoised():
@@ -214,10 +216,7 @@ def test_few_light_paths_are_denoised():
     view = rig.viewpoint(np.random.default_rng(0), np.array([0.5, 0.5]))
     with one_threaded_mitsuba():
         loaded = load_scene(description)
-        many, few, same = (
-            encode(take_photo(loaded, view, samples, seed)).astype(float)
-            for samples, seed in ((400, 1), (9, 2), (9, 2))
-        )
+        many, few, same = (photo(loaded, view, *given) for given in ((400, 1), (9, 2), (9, 2)))
     assert np.array_equal(few, same)
     error = np.square((few - many)[..., :3]).mean()
     # Without denoising, nine paths are at 34 dB.
@@ -231,8 +230,8 @@ def test_depths_and_masks_are_exact():
     views = [rig.viewpoint(rng, np.array(at)) for at in ([0.5, 0.5], [0.53, 0.6])]
     with one_threaded_mitsuba():
         loaded = load_scene(description)
-        seen = [first_hits(loaded, view) for view in views]
-        photo = encode(take_photo(loaded, views[0], 16, 0))
+        seen = [mitsuba_scene.first_hits(loaded, view) for view in views]
+        colors = photo(loaded, views[0], 16, 0)
     for view, (depth, is_object) in zip(views, seen, strict=True):
         rows, columns = np.mgrid[: view.height, : view.width] + 0.5
         x = (columns - 0.5 * view.width) / view.focal
@@ -246,7 +245,7 @@ def test_depths_and_masks_are_exact():
         around = np.isfinite(depth) & ~is_object
         assert around.any()
         assert np.abs(world[around][:, 2]).max() < 1e-4
-    red = photo[..., 0].astype(int) - photo[..., 1] > 40
+    red = colors[..., 0] - colors[..., 1] > 40
     assert (red == seen[0][1]).mean() > 0.95
 
 
@@ -326,24 +325,17 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path):
         synthesize(tmp_path / "file", 1, settings=SMALL)
 
 
-def test_a_scene_with_other_settings_is_not_overwritten(made, tmp_path):
-    shutil.copytree(scene(made, LONE), scene(tmp_path, LONE))
-    with pytest.raises(IgsrError, match="was made with size 24, not 32; give another --out"):
-        synthesize(tmp_path, 1, first=LONE, settings=CaptureSettings(32, 3, 1, 4))
-    with pytest.raises(IgsrError, match="was made with seed 0, not 5"):
-        synthesize(tmp_path, 1, first=LONE, seed=5, settings=SMALL)
-    (scene(tmp_path, LONE) / "scene.json").write_text("{")
-    with pytest.raises(IgsrError, match="is not a finished scene; delete the folder"):
-        synthesize(tmp_path, 1, first=LONE, settings=SMALL)
-
-
-def test_the_command_reports_finished_scenes(made, tmp_path, lab_here):
-    shutil.copytree(scene(made, LONE), scene(tmp_path, LONE))
-    given = ["synth", "--scenes", "1", "--first", LONE, "--out", tmp_path]
-    given += ["--size", "24", "--views", "3", "--test-views", "1", "--spp", "4"]
-    done = lab_here(*given, "--json")
+def test_the_command_reports_finished_scenes_and_overwrites_no_others(lone, lab_here):
+    given = ["synth", "--scenes", "1", "--first", LONE, "--out", lone]
+    given += ["--views", "3", "--test-views", "1", "--spp", "4", "--size"]
+    done = lab_here(*given, "24", "--json")
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
     assert report["scenes"][0]["family"] == "object"
     assert report["settings"] == {"size": 24, "views": 3, "test_views": 1, "spp": 4}
-    assert "0 made, 1 already finished" in lab_here(*given).stdout
+    assert "0 made, 1 already finished" in lab_here(*given, "24").stdout
+    message = "was made with size 24, not 32; give another --out"
+    assert message in lab_here(*given, "32").stderr
+    assert "was made with seed 0, not 5" in lab_here(*given, "24", "--seed", 5).stderr
+    (scene(lone, LONE) / "scene.json").write_text("{")
+    assert "is not a finished scene; delete the folder" in lab_here(*given, "24").stderr
