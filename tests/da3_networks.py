@@ -17,7 +17,6 @@ TINY = NetworkConfig(embed_dim=32, heads=2, features=16, out_channels=(8, 12, 16
 
 def hashed_weight(key, shape):
     """The test weight of a key, of a size that keeps activations and cameras in bounds."""
-    key = key.replace("output_conv2_aux.3.2", "output_conv2_aux.0.2")  # one norm, two names
     u = hashed(key, prod(shape)).astype("float64")
     if key.endswith(".gamma"):
         u = 0.4 + 0.4 * u
@@ -25,16 +24,14 @@ def hashed_weight(key, shape):
         pass
     elif len(shape) == 1:
         u *= 0.2
-        is_norm = "norm" in key or "output_conv2_aux.0.2" in key
+        is_norm = "norm" in key
         u += float((is_norm and key.endswith("weight")) or key == "cam_dec.fc_fov.0.bias")
-        if key.endswith("output_conv2_aux.3.5.bias"):
-            u[2] += 2.0  # rays look ahead
     else:
         gathered = re.search(r"resize_layers\.[01]\.", key)
         u *= (12.0 / (shape[0] if gathered else prod(shape[1:]))) ** 0.5
         if key.startswith("cam_dec.fc_"):
             u *= 0.3
-        if key.endswith(("output_conv2.2.weight", "output_conv2_aux.3.5.weight")):
+        if key.endswith("output_conv2.2.weight"):
             u *= 0.5
     return torch.from_numpy(u.reshape(shape)).float()
 

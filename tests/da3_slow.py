@@ -20,29 +20,25 @@ class SlowDa3:
 
     Args:
         weights: per key an array.
-        heads, camera_heads: of the attention in the backbone and in the camera encoder.
+        heads: of the attention.
     """
 
-    def __init__(self, weights, heads, camera_heads=16):
+    def __init__(self, weights, heads):
         self.w = {key: np.asarray(value, dtype=np.float64) for key, value in weights.items()}
-        self.heads, self.camera_heads = heads, camera_heads
+        self.heads = heads
 
-    def __call__(self, views, reference=0, encodings=None):
-        """Depth, confidence, rays, ray confidence and pose encoding per view.
+    def __call__(self, views, reference=0):
+        """Depth, confidence and pose encoding per view.
 
         Args:
             views: [3, H, W] each.
             reference: index of the view that goes first.
-            encodings: [S, 9] of given cameras, or None.
         """
         grids = [(view.shape[1] // 14, view.shape[2] // 14) for view in views]
         tokens = [self.embedded(view, *grid) for view, grid in zip(views, grids, strict=True)]
         order = [reference] + [n for n in range(len(views)) if n != reference]
         first, other = self.w["backbone.pretrained.camera_token"][0]
         camera_tokens = [first] + [other] * (len(views) - 1)
-        if encodings is not None:
-            order = list(range(len(views)))
-            camera_tokens = self.encoded(encodings)
         tokens = [tokens[n] for n in order]
         features = [[] for _ in views]
         for n in range(12):
@@ -102,13 +98,6 @@ class SlowDa3:
         hidden = gelu(self.linear(f"{name}.mlp.fc1", self.norm(f"{name}.norm2", x, eps)))
         return x + w[f"{name}.ls2.gamma"] * self.linear(f"{name}.mlp.fc2", hidden)
 
-    def encoded(self, encodings):
-        hidden = gelu(self.linear("cam_enc.pose_branch.fc1", encodings))
-        x = self.norm("cam_enc.token_norm", self.linear("cam_enc.pose_branch.fc2", hidden))
-        for n in range(4):
-            x = self.block(f"cam_enc.trunk.{n}", x, self.camera_heads, 1e-5)
-        return self.norm("cam_enc.trunk_norm", x)
-
     def view(self, pairs, rows, columns):
         height, width = 14 * rows, 14 * columns
         levels = []
@@ -121,26 +110,20 @@ class SlowDa3:
             if n == 3:
                 image = self.conv("head.resize_layers.3", image)[:, ::2, ::2]
             levels.append(self.conv(f"head.scratch.layer{n + 1}_rn", image))
-        main, aux = self.joined(levels, ""), self.joined(levels, "_aux")
-        x = resized(self.conv("head.scratch.output_conv1", main), height, width)
+        x = resized(self.conv("head.scratch.output_conv1", self.joined(levels)), height, width)
         x = self.conv("head.scratch.output_conv2.0", placed(x, width / height))
         depth, confidence = np.exp(self.conv("head.scratch.output_conv2.2", np.maximum(x, 0)))
-        for n in range(5):
-            aux = self.conv(f"head.scratch.output_conv1_aux.3.{n}", aux)
-        x = self.conv("head.scratch.output_conv2_aux.3.0", placed(aux, width / height))
-        x = self.norm("head.scratch.output_conv2_aux.3.2", np.moveaxis(x, 0, -1))
-        rays = self.conv("head.scratch.output_conv2_aux.3.5", np.maximum(np.moveaxis(x, -1, 0), 0))
         x = np.concatenate([pairs[-1][0][0], pairs[-1][1][0]])
         for n in (0, 2):
             x = np.maximum(self.linear(f"cam_dec.backbone.{n}", x), 0.0)
         place, turn, fov = (self.linear(f"cam_dec.fc_{n}", x) for n in ("t", "qvec", "fov.0"))
         pose = np.concatenate([place, turn, np.maximum(fov, 0.0)])
-        return depth, 1 + confidence, np.moveaxis(rays[:6], 0, -1), 1 + np.exp(rays[6]), pose
+        return depth, 1 + confidence, pose
 
-    def joined(self, levels, chain):
+    def joined(self, levels):
         x = None
         for n in (4, 3, 2, 1):
-            name = f"head.scratch.refinenet{n}{chain}"
+            name = f"head.scratch.refinenet{n}"
             height, width = levels[n - 1].shape[1:]
             x = levels[n - 1] if x is None else x + self.unit(f"{name}.resConfUnit1", levels[n - 1])
             x = self.unit(f"{name}.resConfUnit2", x)

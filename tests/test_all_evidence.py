@@ -266,7 +266,7 @@ class RoughPredictor:
     def most_photos(self, photos):
         return len(photos)
 
-    def __call__(self, photos, cameras, seed):
+    def __call__(self, photos, seed):
         return predicted(self.truth)
 
 

@@ -14,7 +14,6 @@ from igsr.cameras.da3.backbone import BASE, SMALL
 from igsr.cameras.da3.checkpoint import SIZES, load_checkpoint, load_network, size_of
 from igsr.errors import IgsrError
 
-NORM = "model.head.scratch.output_conv2_aux.{}.2.{}"
 BACKBONE = "backbone__pretrained__"
 
 
@@ -26,13 +25,14 @@ def tiny_as_small(monkeypatch):
 
 
 def published_weights():
-    """Weights as in the published file: the shared norm once, under its first name."""
+    """Weights as in the published file, with parts that igsr does not use."""
     weights = {f"model.{key}": t for key, t in hashed_network().state_dict().items()}
-    for part in ("weight", "bias"):
-        weights[NORM.format(0, part)] = weights.pop(NORM.format(3, part))
-    for level in range(3):
-        weights[f"model.head.scratch.output_conv1_aux.{level}.0.weight"] = torch.zeros(8, 16, 3, 3)
-        weights[f"model.head.scratch.output_conv2_aux.{level}.5.bias"] = torch.zeros(7)
+    for key in (
+        "cam_enc.trunk_norm.bias",
+        "head.scratch.refinenet1_aux.out_conv.bias",
+        "head.scratch.output_conv2_aux.0.2.weight",
+    ):
+        weights[f"model.{key}"] = torch.zeros(7)
     return weights
 
 
@@ -61,27 +61,8 @@ def test_a_loaded_network_has_the_weights_of_the_file(folder, recwarn):
     assert not recwarn.list
     for key, value in network.state_dict().items():
         assert torch.equal(value, hashed_weight(key, value.shape)), key
-    norm = network.head.scratch["output_conv2_aux"]["3"][2]
-    assert not torch.equal(norm.weight, torch.ones(32))
     assert torch.serialization.get_safe_globals() == before[0]
     assert torch.equal(torch.get_rng_state(), before[1])
-
-
-def test_the_shared_norm_under_either_name(folder):
-    weights = published_weights()
-    used = {part: weights.pop(NORM.format(0, part)) for part in ("weight", "bias")}
-    weights |= {NORM.format(3, part): value for part, value in used.items()}
-    save_file(weights, folder / "model.safetensors")
-    found = load_checkpoint(folder).weights
-    assert torch.equal(found["head.scratch.output_conv2_aux.3.2.weight"], used["weight"])
-    # Both names are accepted if they agree.
-    weights |= {NORM.format(0, part): value.clone() for part, value in used.items()}
-    save_file(weights, folder / "model.safetensors")
-    assert load_checkpoint(folder).unknown == []
-    weights[NORM.format(0, "bias")] += 1e-3
-    save_file(weights, folder / "model.safetensors")
-    with pytest.raises(IgsrError, match=r"aux\.3\.2\.bias and .*aux\.0\.2\.bias differ"):
-        load_checkpoint(folder)
 
 
 def test_half_precision_becomes_float32_and_shapes_give_the_size(folder):
@@ -103,7 +84,6 @@ def test_ignored_keys_are_listed(folder):
     ("key", "value", "message"),
     [
         (f"{BACKBONE}norm__bias", None, r"has no model\.backbone\.pretrained\.norm\.b"),
-        ("head__scratch__output_conv2_aux__0__2__weight", None, r"has no .*aux\.0\.2\.weight"),
         (
             f"{BACKBONE}camera_token",
             torch.zeros(1, 1, 32),
@@ -163,7 +143,6 @@ def published_config(name, config, net):
         "config": {
             "net": part("DinoV2", name=net, out_layers=[5, 7, 9, 11], **blocks),
             "head": part("DualDPT", dim_in=2 * dim, **head),
-            "cam_enc": part("CameraEnc", dim_out=dim),
             "cam_dec": part("CameraDec", dim_in=2 * dim),
         },
     }
@@ -177,9 +156,6 @@ def test_sizes_of_the_published_configs():
     assert size_of(small, "c") == "da3-small"
     assert size_of({"config": big["config"]}, "c") == "da3-base"
     assert size_of({"model_name": "da3-base"}, "c") == "da3-base"
-    # The camera encoder is only needed for known cameras.
-    del big["config"]["cam_enc"]
-    assert size_of(big, "c") == "da3-base"
 
 
 @pytest.mark.parametrize(
@@ -191,7 +167,6 @@ def test_sizes_of_the_published_configs():
         ("net", "name", "vitl"),
         ("head", "features", 256),
         ("head", "out_channels", [96, 192, 384, 1024]),
-        ("cam_enc", "dim_out", 1024),
         ("cam_dec", "dim_in", 3072),
         ("cam_dec", "__object__", {"path": "os", "name": "system", "args": "ls"}),
     ],

@@ -7,13 +7,11 @@ import pytest
 import torch
 from da3_networks import TINY, hashed_network, hashed_pixels
 from da3_slow import SlowDa3
-from scenes import ring_camera
 
 from igsr.cameras.da3.backbone import BASE, SMALL, reference_view
-from igsr.cameras.da3.cameras import encode_pose, normalized_viewmats
 from igsr.cameras.da3.network import Da3Network
 
-FIELDS = ("depth", "confidence", "rays", "ray_confidence", "pose_encoding")
+FIELDS = ("depth", "confidence", "pose_encoding")
 #: The float32 network reached 2e-6 of the largest value; half precision is off by 1e-3.
 CLOSE = 2e-5
 
@@ -50,17 +48,6 @@ def test_views_may_differ_in_size(network, slow):
     check(network.predict(views, reference=0), slow([view.numpy() for view in views]))
 
 
-def test_known_cameras_as_in_the_slow_network(network, slow):
-    pixels = hashed_pixels("cameras", 3, 42, 70)
-    viewmats = np.stack([ring_camera(0.3 * n).viewmat for n in range(3)])
-    intrinsics = np.tile(np.diag([80.0, 75.0, 1.0]), (3, 1, 1))
-    found = network.predict(
-        list(pixels), viewmats=torch.from_numpy(viewmats), intrinsics=torch.from_numpy(intrinsics)
-    )
-    encodings = encode_pose(normalized_viewmats(viewmats), intrinsics, [(42, 70)] * 3)
-    check(found, slow(list(pixels.numpy()), encodings=encodings.numpy()))
-
-
 def test_stored_positions_are_used_for_518_pixels(network, slow):
     pixels = hashed_pixels("square", 1, 518, 518)
     backbone = network.backbone["pretrained"]
@@ -79,38 +66,25 @@ def test_the_order_of_views_does_not_matter(network):
         torch.testing.assert_close(found, value, atol=close, rtol=0.0)
 
 
-def test_without_rays_the_rest_is_the_same(network):
-    views = list(hashed_pixels("rays", 2, 42, 56))
-    with_rays, without = network.predict(views), network.predict(views, rays=False)
-    for one, other in zip(with_rays, without, strict=True):
-        assert other.rays is None
-        assert other.ray_confidence is None
-        assert torch.equal(one.depth, other.depth)
-        assert torch.equal(one.pose_encoding, other.pose_encoding)
-
-
 def test_half_precision_is_close_and_predictions_are_float32(network):
     # As on CUDA devices, where blocks run in half precision.
     views = list(hashed_pixels("half", 3, 42, 56))
-    cameras = {
-        "viewmats": torch.eye(4).repeat(3, 1, 1),
-        "intrinsics": torch.diag(torch.tensor([60.0, 60.0, 1.0])).repeat(3, 1, 1),
-    }
-    for given in ({}, cameras):
-        exact = network.predict(views, reference=0, **given)
-        with torch.autocast("cpu", dtype=torch.bfloat16):
-            near = network.predict(views, reference=0, **given)
-        for one, other in zip(exact, near, strict=True):
-            for name in FIELDS:
-                value, found = getattr(one, name), getattr(other, name)
-                assert found.dtype == torch.float32
-                off = float((found - value).abs().max() / value.abs().max())
-                assert 1e-6 < off < 0.05, (name, off)
+    exact = network.predict(views, reference=0)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        near = network.predict(views, reference=0)
+    for one, other in zip(exact, near, strict=True):
+        for name in FIELDS:
+            value, found = getattr(one, name), getattr(other, name)
+            assert found.dtype == torch.float32
+            off = float((found - value).abs().max() / value.abs().max())
+            assert 1e-6 < off < 0.05, (name, off)
 
 
 def test_published_sizes_have_their_number_of_parameters():
-    # Distinct parameters less the levels of the ray head that only training needs.
-    for config, count in ((SMALL, 34_299_463 - 305_589), (BASE, 135_366_599 - 1_163_349)):
+    # Of the published ones without the camera encoder and the ray head.
+    small = 34_299_463 - 7_178_496 - (635_559 + 305_589)
+    base = 135_366_599 - 28_660_224 - (2_520_071 + 1_163_349)
+    for config, count in ((SMALL, small), (BASE, base)):
         with torch.device("meta"):
             network = Da3Network(config)
         assert sum(value.numel() for value in network.parameters()) == count
@@ -136,5 +110,5 @@ def test_the_reference_is_chosen_from_three_views_on(network, monkeypatch, count
     monkeypatch.setattr(
         "igsr.cameras.da3.backbone.reference_view", lambda tokens: seen.append(tokens.shape) or 1
     )
-    network.predict(list(hashed_pixels("choice", count, 28, 28)), rays=False)
+    network.predict(list(hashed_pixels("choice", count, 28, 28)))
     assert seen == [(count, TINY.embed_dim)] * chosen

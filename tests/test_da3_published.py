@@ -17,7 +17,7 @@ from PIL import Image
 from safetensors import safe_open
 
 from igsr.cameras.da3.backbone import SMALL, NetworkConfig
-from igsr.cameras.da3.cameras import decode_pose, encode_pose, normalized_viewmats
+from igsr.cameras.da3.cameras import decode_pose
 from igsr.cameras.da3.checkpoint import read_weights
 from igsr.cameras.da3.network import Da3Network
 from igsr.cameras.da3.prediction import network_input, resampled, resampling_of
@@ -30,8 +30,6 @@ OUTPUTS = {
     "pose_encoding": ("pose", ACTIVATION),
     "depth": ("depth", PREDICTION),
     "confidence": ("depth_conf", PREDICTION),
-    "rays": ("ray", PREDICTION),
-    "ray_confidence": ("ray_conf", PREDICTION),
 }
 
 
@@ -91,32 +89,12 @@ def test_predictions_and_cameras(network, views):
             check(f"{rule}.depth_mean", means, wanted[f"{rule}.depth_mean"], PREDICTION)
 
 
-def test_known_cameras(network):
-    wanted = stored("tiny_cameras3.npz")
-    viewmats, intrinsics = wanted["viewmats"], wanted["intrinsics"]
-    normalized = normalized_viewmats(viewmats)
-    check("normalized_viewmats", normalized, wanted["normalized_viewmats"], ACTIVATION)
-    encoding = encode_pose(normalized, intrinsics, [(42, 70)] * 3)
-    check("encoding", encoding, wanted["encoding"], ACTIVATION)
-    check("tokens", network.cam_enc(encoding.float()), wanted["tokens"], ACTIVATION)
-    found = predicted(
-        network,
-        torch.from_numpy(wanted["pixels"]),
-        viewmats=torch.from_numpy(viewmats),
-        intrinsics=torch.from_numpy(intrinsics),
-    )
-    for name, (key, bound) in OUTPUTS.items():
-        check(f"out.{key}", found[name], wanted[f"out.{key}"], bound)
-
-
 @pytest.mark.parametrize("case", ["a", "b"])
 def test_small_at_full_size(case):
     wanted, network = stored("small_hashed.npz"), hashed_network(SMALL)
     found = predicted(network, torch.from_numpy(wanted[f"{case}.pixels"]))
     for name, (key, bound) in OUTPUTS.items():
-        value = found[name]
-        value = value[:, ::4, ::4] if key.startswith("ray") else value
-        check(f"SMALL {case}.{key}", value, wanted[f"{case}.{key}"], bound)
+        check(f"SMALL {case}.{key}", found[name], wanted[f"{case}.{key}"], bound)
 
 
 def test_cameras_of_encodings():
@@ -125,8 +103,6 @@ def test_cameras_of_encodings():
     w2c, K = decode_pose(wanted["encoding"], height, width)
     check("extrinsics", w2c, wanted["extrinsics"], 1e-5)
     np.testing.assert_allclose(K, wanted["intrinsics"], rtol=1e-6)
-    again = encode_pose(w2c[4:], K[4:], [(height, width)] * (len(K) - 4))
-    check("encoding_again", again, wanted["encoding_again"], 1e-5)
 
 
 @pytest.mark.parametrize("name", ["a", "b"])
@@ -139,8 +115,6 @@ def test_photos(name):
     check(f"{key}.levels", levels, wanted[f"{key}.levels"], 1)
     mean = np.abs(levels - wanted[f"{key}.levels"]).mean()
     check(f"{key}.levels, mean", mean, 0.0, 0.02)
-    K = resampling.intrinsics(wanted[f"{name}.K"])
-    check(f"{key}.K", K, wanted[f"{key}.K"], 1e-4)
     # One gray level, in units of the channel's standard deviation.
     pixels = network_input(image, resampling)
     check(f"{key}.pixels", pixels, wanted[f"{key}.pixels"], 1.01 / 255 / 0.224)

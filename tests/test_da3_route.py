@@ -75,7 +75,7 @@ class ExactPredictor:
     def most_photos(self, photos):
         return self.most
 
-    def __call__(self, photos, cameras, seed):
+    def __call__(self, photos, seed):
         self.shown.append([photo.name for photo in photos])
         random = np.random.default_rng(len(self.shown))
         rotation = np.linalg.qr(random.normal(size=(3, 3)))[0]
@@ -158,8 +158,8 @@ def test_every_photo_is_in_a_pass_and_all_passes_overlap(count, most):
 
 def test_wrong_pixels_of_shared_photos_have_no_influence():
     cameras, photos, predictor = exact_scene(6)
-    one = dict(enumerate(predictor(photos[:4], None, 0)))
-    two = dict(enumerate(predictor(photos[2:], None, 0), start=2))
+    one = dict(enumerate(predictor(photos[:4], 0)))
+    two = dict(enumerate(predictor(photos[2:], 0), start=2))
     depth = two[2].depth.copy()
     depth[:20] *= 3.0  # a third of one shared photo of two
     two[2] = replace(two[2], depth=depth)
@@ -215,43 +215,9 @@ def test_one_camera_has_one_focal_length():
     assert with_shared_focals(photos[:1], [None]) == [None]
 
 
-def test_known_cameras_are_kept_and_define_the_world():
-    cameras, photos, predictor = exact_scene(9, most=5)
-    off = cameras[4].K + [[0.0, 0.0, 0.2 * SIZE], [0.0] * 3, [0.0] * 3]
-    given = dict(predictor.cameras)
-    found = unadjusted(predictor, cameras=given)(photos)
-    assert len(predictor.shown) > 1
-    for camera, wanted, depth in zip(found.cameras, cameras, found.depths, strict=True):
-        assert camera is wanted
-        truth = spheres(wanted, resampling_of(SIZE, SIZE, 56).grid().photo_pixels())
-        np.testing.assert_allclose(depth.ravel(), truth, rtol=1e-4)
-    assert found.warnings == []
-    given["04.png"] = replace(cameras[4], K=off)
-    found = unadjusted(predictor, cameras=given)(photos)
-    assert found.warnings[0].startswith("The principal point of 04.png is far from the center")
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda given: {**given, "x.png": given["00.png"]}, "'x.png', which is none of the photos"),
-        (lambda given: {"00.png": given["00.png"]}, "has none for 01.png, 02.png"),
-        (
-            lambda given: {**given, "00.png": replace(given["00.png"], width=9)},
-            "of 9 x 64 pixels, and the photo has 64 x 64",
-        ),
-        (lambda given: dict.fromkeys(given, given["00.png"]), "all stand at one place"),
-    ],
-)
-def test_known_cameras_that_cannot_be_used(change, message):
-    _, photos, predictor = exact_scene(3)
-    with pytest.raises(IgsrError, match=message):
-        unadjusted(predictor, cameras=change(predictor.cameras))(photos)
-
-
 def test_a_depth_of_a_single_photo_is_not_trusted():
     _, photos, predictor = exact_scene(6)
-    exact = predictor(photos, None, 0)
+    exact = predictor(photos, 0)
     before = trusted_depths(exact)
     wrong = exact[2].depth.copy()
     wrong[20:30, 20:40] *= 0.7
@@ -271,7 +237,7 @@ def test_masked_and_transparent_pixels_have_no_confidence():
     mask = np.ones((SIZE, SIZE), dtype=bool)
     mask[:16] = False
     given = [replace(photos[0], image=image, mask=mask), photos[1]]
-    first, second = Da3Predictor(hashed_network())(given, None, 0)
+    first, second = Da3Predictor(hashed_network())(given, 0)
     assert (first.confidence[:, : first.confidence.shape[1] // 2] == 1.0).all()
     assert (first.confidence[: first.confidence.shape[0] // 4] == 1.0).all()
     assert (first.confidence[-3:, -3:] > 1.0).all()
