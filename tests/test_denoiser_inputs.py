@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
+from capture_files import assert_refused
 
 import igsr
 from igsr.capture import Camera, View
@@ -85,8 +86,7 @@ def test_empty_pixels_are_zero():
 
 def test_buffers_of_other_shapes_are_refused():
     color = np.zeros((4, 5, 3), np.float32)
-    with pytest.raises(igsr.IgsrError, match=r"^color must be \[H, W, 3\], not \[4, 5\]$"):
-        Buffers(color=color[..., 0])
+    assert_refused(r"^color must be \[H, W, 3\], not \[4, 5\]$", Buffers, color=color[..., 0])
     with pytest.raises(igsr.IgsrError, match=r"^alpha must be \[4, 5\] as color, not \[5, 4\]$"):
         Buffers(color=color, alpha=np.zeros((5, 4), np.float32))
     with pytest.raises(igsr.IgsrError, match="camera is of a 32x32 picture, color is 5x4"):
@@ -177,8 +177,7 @@ def test_the_background_is_an_input():
     assert np.allclose(inputs[at : at + 5, 0, 0], [0.2, 0.4, 0.6, 1.0, 0.0])
     assert np.ptp(inputs[at:], axis=(1, 2)).max() == 0.0, "the same everywhere"
     assert not network_inputs(Buffers(color), nothing_warped(8, 8))[at:].any()
-    with pytest.raises(igsr.IgsrError, match=r"background must be \[3\], not \[2\]"):
-        Buffers(color, background=behind[:2])
+    assert_refused(r"background must be \[3\], not \[2\]", Buffers, color, background=behind[:2])
 
 
 def test_buffers_have_the_background():
@@ -240,5 +239,4 @@ def test_a_far_pixel_does_not_change_other_depths():
 
 
 def test_bytes_are_refused_as_color():
-    with pytest.raises(igsr.IgsrError, match="color must be of floats"):
-        Buffers(color=np.zeros((8, 8, 3), np.uint8))
+    assert_refused("color must be of floats", Buffers, color=np.zeros((8, 8, 3), np.uint8))

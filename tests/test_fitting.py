@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
+from capture_files import assert_refused
 from made_up_tracks import tracked
 
 import igsr
@@ -286,20 +287,16 @@ def test_splats_start_at_points_however_far_away(capture):
     ],
 )
 def test_bad_settings_are_named(capture, options, message):
-    with pytest.raises(igsr.IgsrError, match=message):
-        igsr.fit(capture, **OPTIONS | options)
+    assert_refused(message, igsr.fit, capture, **OPTIONS | options)
 
 
 def test_unknown_settings_and_captures_are_named(capture):
-    with pytest.raises(igsr.IgsrError, match="unknown setting preset"):
-        fit(capture, preset="3dgs")
-    with pytest.raises(igsr.IgsrError, match=r"capture must be a Capture, not str; igsr\.load"):
-        fit("photos")
+    assert_refused("unknown setting preset", fit, capture, preset="3dgs")
+    assert_refused(r"capture must be a Capture, not str; igsr\.load", fit, "photos")
 
 
 def test_resume_needs_a_folder(capture):
-    with pytest.raises(igsr.IgsrError, match="resume needs out"):
-        igsr.fit(capture, resume=True)
+    assert_refused("resume needs out", igsr.fit, capture, resume=True)
 
 
 def test_fit_applies_every_setting(capture):
@@ -333,8 +330,7 @@ def test_a_checkpoint_that_cannot_be_written_is_found_before_the_fit(capture, tm
     blocked.write_text("not a folder")
     events = []
     for path in (blocked / "checkpoint.npz", tmp_path):
-        with pytest.raises(igsr.IgsrError, match="Cannot write"):
-            fit(capture, checkpoint=path, report=events.append)
+        assert_refused("Cannot write", fit, capture, checkpoint=path, report=events.append)
     assert not events
 
 
@@ -410,8 +406,7 @@ def test_resume_refuses_other_versions(capture, finished, tmp_path):
         ({"format": 2}, "it is not of format 1"),
     ):
         save_checkpoint(path, state, settings | other)
-        with pytest.raises(igsr.IgsrError, match=message):
-            fit_capture(capture, checkpoint=path, resume=True, **SHORT)
+        assert_refused(message, fit_capture, capture, checkpoint=path, resume=True, **SHORT)
     with pytest.raises(igsr.IgsrError, match="no checkpoint"):
         fit_capture(capture, checkpoint=tmp_path / "none.npz", resume=True, **SHORT)
 
@@ -445,8 +440,7 @@ def test_damaged_checkpoints_are_refused(capture, finished, tmp_path):
     path = tmp_path / "bad.npz"
 
     def check_refused(message):
-        with pytest.raises(igsr.IgsrError, match=message):
-            fit_capture(capture, checkpoint=path, resume=True, **SHORT)
+        assert_refused(message, fit_capture, capture, checkpoint=path, resume=True, **SHORT)
 
     for damaged in bad_files(content):
         path.write_bytes(damaged)
@@ -470,8 +464,7 @@ def test_array_headers_that_do_not_parse_are_refused(tmp_path, header):
     with zipfile.ZipFile(path, "w") as archive:
         member = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header.encode()
         archive.writestr("means.npy", member)
-    with pytest.raises(igsr.IgsrError, match="cannot be read"):
-        load_checkpoint(path)
+    assert_refused("cannot be read", load_checkpoint, path)
 
 
 def test_an_array_larger_than_its_file_is_refused(tmp_path):
@@ -482,8 +475,7 @@ def test_an_array_larger_than_its_file_is_refused(tmp_path):
     path = tmp_path / "huge.npz"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("means.npy", header.getvalue() + b"\0" * 16)
-    with pytest.raises(igsr.IgsrError, match="another size than its header says"):
-        load_checkpoint(path)
+    assert_refused("another size than its header says", load_checkpoint, path)
 
 
 @pytest.mark.parametrize("alpha", [False, True])
@@ -495,10 +487,8 @@ def test_extreme_cameras_are_refused(alpha, distance, focal):
         viewmat[:3, 3] *= distance / 4.0
         K = np.array([[focal, 0.0, 8.0], [0.0, focal, 8.0], [0.0, 0.0, 1.0]])
         views.append(replace(view, camera=igsr.Camera(viewmat, K, 16, 16)))
-    with pytest.raises(igsr.IgsrError, match="check its poses"):
-        fit(igsr.Capture("far", views), steps=3)
+    assert_refused("check its poses", fit, igsr.Capture("far", views), steps=3)
 
 
 def test_fit_needs_train_views(capture):
-    with pytest.raises(igsr.IgsrError, match="no train views"):
-        fit(with_views(capture, split="test"))
+    assert_refused("no train views", fit, with_views(capture, split="test"))

@@ -10,7 +10,7 @@ import av
 import numpy as np
 import pillow_heif
 import pytest
-from capture_files import photo, save
+from capture_files import assert_refused, photo, save
 from PIL import Image, ImageOps
 from test_capture_photos import write_png
 
@@ -158,8 +158,7 @@ def test_damaged_photo_is_left_out_by_name(tmp_path, suffix):
             assert len(read_photos(tmp_path)) in (2, 3)
     (tmp_path / "a.png").unlink()
     broken.write_bytes(b"no photo at all")
-    with pytest.raises(IgsrError, match=rf"b\{suffix} cannot be read as an image"):
-        read_photos(tmp_path)
+    assert_refused(rf"b\{suffix} cannot be read as an image", read_photos, tmp_path)
 
 
 def test_several_damaged_photos_are_one_sentence(tmp_path):
@@ -179,20 +178,16 @@ def test_bad_arguments(tmp_path, monkeypatch):
         ([], "empty list"),
         ([tmp_path / "1.png"], "does not exist"),
     ):
-        with pytest.raises(IgsrError, match=words):
-            read_photos(path)
+        assert_refused(words, read_photos, path)
     first, second = save(tmp_path / "1.png", photo(1)), save(tmp_path / "b/2.png", photo(2))
     text = tmp_path / "a.txt"
     text.write_text("")
     for files, words in (([first, first], "given twice"), ([first, text], r"a\.txt is no photo")):
-        with pytest.raises(IgsrError, match=words):
-            read_photos(files)
-    with pytest.raises(IgsrError, match="frames is 0"):
-        read_photos(tmp_path, frames=0)
+        assert_refused(words, read_photos, files)
+    assert_refused("frames is 0", read_photos, tmp_path, frames=0)
     assert [photo.name for photo in read_photos([second, first])] == ["b/2.png", "1.png"]
     monkeypatch.setattr(memory_check, "available_memory", lambda: 8192)
-    with pytest.raises(IgsrError, match=r"The 2 photos of 48x32 would need 0.0 GB and 0.0 GB are"):
-        read_photos(tmp_path)
+    assert_refused(r"The 2 photos of 48x32 would need 0.0 GB and 0.0 GB are", read_photos, tmp_path)
 
 
 # --- videos -------------------------------------------------------------------------------------
@@ -266,5 +261,4 @@ def test_damaged_videos(tmp_path):
     assert 1 <= len(read_photos(path, frames=4)) <= 4  # the readable part
     for content in (b"", b"no video", whole[:100]):
         path.write_bytes(content)
-        with pytest.raises(IgsrError, match=r"clip\.avi (cannot be read as a video|has no frame)"):
-            read_photos(path)
+        assert_refused(r"clip\.avi (cannot be read as a video|has no frame)", read_photos, path)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
+from capture_files import assert_refused
 from refinements import BALL, STEPS, WHITE, same
 
 import igsr
@@ -41,10 +42,8 @@ def test_weights_of_one_are_as_none_and_weights_of_zero_as_a_mask(ball_photos):
     assert same(whole, fitted([pseudo(view) for view in photos]))
     assert same(half, fitted([replace(view, mask=left > 0) for view in photos]))
     assert not same(whole, half)
-    with pytest.raises(igsr.IgsrError, match="weights must be finite and not negative"):
-        pseudo(photos[0], -left)
-    with pytest.raises(igsr.IgsrError, match="weights"):
-        pseudo(photos[0], left[1:])
+    assert_refused("weights must be finite and not negative", pseudo, photos[0], -left)
+    assert_refused("weights", pseudo, photos[0], left[1:])
 
 
 @pytest.mark.filterwarnings("ignore:.*have the same camera", "ignore:.*black or fully")
@@ -77,8 +76,7 @@ def test_a_fit_continues_from_splats(ball_photos):
         (first, {"max_splats": 2}, "give at least one and at most max_splats"),
         (antialiased, {}, "antialiased"),
     ):
-        with pytest.raises(igsr.IgsrError, match=message):
-            scenes.fit(ball_photos, 5, start=start, backend="cpu", **settings)
+        assert_refused(message, scenes.fit, ball_photos, 5, start=start, backend="cpu", **settings)
 
 
 @pytest.mark.filterwarnings("ignore:.*have the same camera")
