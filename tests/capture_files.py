@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pycolmap
+import pytest
 from PIL import Image
 
 from igsr.errors import IgsrError
@@ -19,10 +20,7 @@ MODEL_PARAMS = {
     "SIMPLE_RADIAL": [40.0, 23.0, 17.0, -0.12],
     "RADIAL": [40.0, 23.0, 17.0, -0.12, 0.03],
     "OPENCV": [40.0, 42.0, 23.0, 17.0, -0.12, 0.03, 0.004, -0.006],
-    "FULL_OPENCV": [
-        *(40.0, 42.0, 23.0, 17.0),
-        *(-0.12, 0.03, 0.004, -0.006, 0.01, 0.02, -0.01, 0.005),
-    ],
+    "FULL_OPENCV": [40.0, 42.0, 23.0, 17.0, -0.12, 0.03, 0.004, -0.006, 0.01, 0.02, -0.01, 0.005],
     "OPENCV_FISHEYE": [30.0, 32.0, 23.0, 17.0, 0.05, -0.02, 0.01, -0.003],
     "SIMPLE_RADIAL_FISHEYE": [30.0, 23.0, 17.0, 0.05],
     "RADIAL_FISHEYE": [30.0, 23.0, 17.0, 0.05, -0.02],
@@ -122,6 +120,12 @@ def write_colmap(folder, model="PINHOLE", *, text=False, viewmats=None, place="s
     (folder / place).mkdir(parents=True, exist_ok=True)
     (reconstruction.write_text if text else reconstruction.write_binary)(folder / place)
     return reconstruction
+
+
+def assert_refused(words, load, *arguments, **options):
+    """``load`` raises an error with these words."""
+    with pytest.raises(IgsrError, match=words):
+        load(*arguments, **options)
 
 
 def assert_damage_is_refused(path, load, rng, count, choices):

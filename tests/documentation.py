@@ -12,15 +12,11 @@ ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
 
 #: Pages whose code blocks a newcomer types: they are run.
-TYPED = sorted(
-    ["README.md", "docs/index.md", "docs/getting-started.md"]
-    + [path.relative_to(ROOT).as_posix() for path in (DOCS / "guides").glob("*.md")]
-)
+TYPED = ["README.md", "docs/index.md", "docs/getting-started.md"]
+TYPED += sorted(path.relative_to(ROOT).as_posix() for path in DOCS.glob("guides/*.md"))
 #: All pages.
-PAGES = sorted(
-    ["README.md", "CONTRIBUTING.md", "CHANGELOG.md"]
-    + [path.relative_to(ROOT).as_posix() for path in DOCS.rglob("*.md")]
-)
+PAGES = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md"]
+PAGES += sorted(path.relative_to(ROOT).as_posix() for path in DOCS.rglob("*.md"))
 #: Pages of the site that show a file of the root in their place.
 SHOWN = {
     "docs/how-it-works/contributing.md": "CONTRIBUTING.md",
@@ -35,21 +31,13 @@ _DEFINITION = re.compile(r"^\[[^\]]+\]:\s+(\S+)", re.MULTILINE)
 
 @dataclass(frozen=True)
 class Block:
-    """A fenced code block.
+    """A fenced code block."""
 
-    Attributes:
-        page: path of its page in the repository.
-        line: of its first line of code.
-        language: "sh", "python", "text" or another, as written.
-        code: what stands between the fences.
-        not_run: why it is not run, from the comment before it, or None.
-    """
-
-    page: str
-    line: int
+    page: str  # path in the repository
+    line: int  # of its first line of code
     language: str
     code: str
-    not_run: str | None
+    not_run: str | None  # why it is not run, from the comment before it
 
     @property
     def place(self) -> str:
@@ -66,15 +54,9 @@ def blocks(page: str) -> list[Block]:
     found = []
     for match in _FENCE.finditer(text):
         reason = _NOT_RUN.search(text, 0, match.start())
-        found.append(
-            Block(
-                page,
-                text.count("\n", 0, match.start(4)) + 1,
-                match[3],
-                re.sub(rf"^{match[1]}", "", match[4], flags=re.MULTILINE),
-                reason[1] if reason else None,
-            )
-        )
+        line = text.count("\n", 0, match.start(4)) + 1
+        code = re.sub(rf"^{match[1]}", "", match[4], flags=re.MULTILINE)
+        found.append(Block(page, line, match[3], code, reason[1] if reason else None))
     return found
 
 
@@ -96,8 +78,7 @@ def links(page: str) -> list[str]:
 
 def anchors(page: str) -> set[str]:
     """Names of a page's headings that work both on the site and on a forge."""
-    on_site: set[str] = set()
-    on_forge: set[str] = set()
+    on_site, on_forge = set(), set()
     for heading in re.findall(r"^#{1,6}\s+(.+?)\s*#*$", prose(page), re.MULTILINE):
         plain = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading).replace("`", "")
         ascii_only = unicodedata.normalize("NFKD", plain).encode("ascii", "ignore").decode()
@@ -106,7 +87,7 @@ def anchors(page: str) -> set[str]:
     return on_site & on_forge
 
 
-def commands(code: str) -> list[list[str]]:
+def commands(code):
     """The commands of a shell block, as words; comments left out, continued lines joined."""
     lines = re.sub(r"\\\n", " ", code).splitlines()
     return [words for line in lines if (words := shlex.split(line, comments=True))]

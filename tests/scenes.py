@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from igsr import rasterization
 from igsr.capture import Camera, Capture, PseudoView, View
@@ -129,10 +131,6 @@ def pseudo_view(view, **changes):
 
 def write_capture(folder, made):
     """A made-up capture as transforms.json and PNG files; returns the folder."""
-    import json
-
-    from PIL import Image
-
     frames = []
     for view in made.views:
         path = folder / view.name
@@ -140,18 +138,9 @@ def write_capture(folder, made):
         Image.fromarray(view.image).save(path)
         pose = np.linalg.inv(view.camera.viewmat) @ np.diag([1.0, -1.0, -1.0, 1.0])
         K = view.camera.K
-        frames.append(
-            {
-                "file_path": view.name,
-                "transform_matrix": pose.tolist(),
-                "fl_x": K[0, 0],
-                "fl_y": K[1, 1],
-                "cx": K[0, 2],
-                "cy": K[1, 2],
-                "w": view.camera.width,
-                "h": view.camera.height,
-            }
-        )
+        frame = {"file_path": view.name, "transform_matrix": pose.tolist()}
+        frame |= {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+        frames.append(frame | {"w": view.camera.width, "h": view.camera.height})
     (folder / "transforms.json").write_text(json.dumps({"frames": frames}))
     return folder
 
@@ -160,10 +149,7 @@ def project_call():
     """Arguments of ``_core.project`` that draw the small scene."""
     scene, camera = splats(), ring_camera(0.0)
     return {
-        "means": scene.means,
-        "quats": scene.quats,
-        "scales": scene.scales,
-        "opacities": scene.opacities,
+        **{name: getattr(scene, name) for name in ("means", "quats", "scales", "opacities")},
         "colors": scene.sh,
         "sh_degree": 1,
         "raw_parameters": True,

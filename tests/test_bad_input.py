@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import scenes
 import torch
+from capture_files import assert_refused
 
 import igsr
 from igsr import _core, rasterization
@@ -30,6 +31,10 @@ def with_entry(index, value):
         return tensor
 
     return change
+
+
+def features(*shape):
+    return {"colors": torch.zeros(*shape), "sh_degree": None}
 
 
 BAD = {
@@ -80,12 +85,7 @@ BAD = {
     "rasterize_mode unknown": {"rasterize_mode": "smooth"},
     "rasterize_mode list": {"rasterize_mode": ["classic"]},
     "absgrad number": {"absgrad": 1},
-    "absgrad features": {
-        "absgrad": True,
-        "colors": torch.zeros(5, 4),
-        "sh_degree": None,
-        "backgrounds": None,
-    },
+    "absgrad features": {"absgrad": True, "backgrounds": None, **features(5, 4)},
     "absgrad normals": {"absgrad": True, "render_normals": True},
     "render_normals text": {"render_normals": "yes"},
     "masks dtype": {"masks": torch.ones(2, 20, 24)},
@@ -97,13 +97,9 @@ BAD = {
     "backgrounds pixels": {"backgrounds": torch.zeros(2, 24, 20, 3)},
     "backgrounds pixel nan": {"backgrounds": torch.full((2, 20, 24, 3), float("nan"))},
     "backgrounds dtype": {"backgrounds": torch.zeros(2, 20, 24, 3, dtype=torch.float64)},
-    "colors no channels": {"colors": torch.zeros(5, 0), "sh_degree": None},
-    "colors per camera": {"colors": torch.zeros(3, 5, 8), "sh_degree": None},
-    "backgrounds features": {
-        "colors": torch.zeros(5, 8),
-        "sh_degree": None,
-        "backgrounds": torch.zeros(2, 3),
-    },
+    "colors no channels": features(5, 0),
+    "colors per camera": features(3, 5, 8),
+    "backgrounds features": {"backgrounds": torch.zeros(2, 3), **features(5, 8)},
     "backend unknown": {"backend": "abacus"},
     "backend None": {"backend": None},
     "backend list": {"backend": ["cpu"]},
@@ -127,20 +123,11 @@ UNSUPPORTED = {
     "render_mode": "RGB-d",
 }
 #: Those of gsplat's development branch, with their defaults.
-NEWER = {
-    "tile_size": None,
-    "macro_tile": False,
-    "return_normals": False,
-    "global_z_order": True,
-    "rays": None,
-    "lidar_coeffs": None,
-    "external_distortion_coeffs": None,
-    "ut_params": None,
-    "extra_signals": None,
-    "extra_signals_sh_degree": None,
-    "renderer_config": None,
-    "nht_params": None,
-}
+NEWER = {"macro_tile": False, "return_normals": False, "global_z_order": True}
+NEWER |= dict.fromkeys(
+    ["tile_size", "rays", "lidar_coeffs", "external_distortion_coeffs", "ut_params"]
+    + ["extra_signals", "extra_signals_sh_degree", "renderer_config", "nht_params"]
+)
 UNSUPPORTED |= {
     name: torch.ones(2) if default is None else not default for name, default in NEWER.items()
 }
@@ -160,22 +147,18 @@ def test_messages_begin_with_the_name_of_a_bad_argument(case):
         call(BAD[case])
 
 
+def defaults(function):
+    parameters = inspect.signature(function).parameters.values()
+    return {p.name: p.default for p in parameters if p.default is not p.empty}
+
+
 def test_defaults_of_gsplat_are_accepted():
-    ours, theirs = (
-        {
-            name: parameter.default
-            for name, parameter in inspect.signature(function).parameters.items()
-            if parameter.default is not inspect.Parameter.empty
-        }
-        for function in (rasterization, gsplat.rasterization)
-    )
+    ours, theirs = map(defaults, (rasterization, gsplat.rasterization))
     for name in ours.keys() & theirs.keys():
         assert ours[name] == theirs[name], name
     color, _, _ = call({**theirs, "sh_degree": 2})
     assert torch.equal(color, call({"backgrounds": None})[0])
-
-
-def test_defaults_of_newer_gsplat_are_accepted():
+    # Those of its development branch too.
     color, _, meta = call(NEWER)
     assert torch.equal(color, call({})[0])
     assert meta["tile_size"] == 16
@@ -214,17 +197,9 @@ def test_a_distant_pinhole_is_nearly_orthographic():
     K = torch.tensor([[scale * distance, 0, 16], [0, scale * distance, 16], [0, 0, 1]])
     columns = []
     for mean in ([-0.5, 0.0, -0.5], [0.5, 0.0, 0.5]):
-        _, alpha, _ = rasterization(
-            torch.tensor([mean]),
-            torch.tensor([[1.0, 0, 0, 0]]),
-            torch.full((1, 3), 0.1),
-            torch.tensor([0.9]),
-            torch.ones(1, 3),
-            viewmat[None],
-            K[None],
-            32,
-            32,
-        )
+        splat = torch.tensor([mean]), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 0.1)
+        look = torch.tensor([0.9]), torch.ones(1, 3)
+        _, alpha, _ = rasterization(*splat, *look, viewmat[None], K[None], 32, 32)
         weights = alpha[0, ..., 0].double().sum(0)
         columns.append(float((weights * (torch.arange(32) + 0.5)).sum() / weights.sum()))
     assert abs(columns[1] - columns[0] - scale) < 0.05
@@ -253,20 +228,13 @@ def test_a_splat_that_is_not_finite_changes_no_other(slot, value):
         assert torch.equal(color, clean)
 
 
-@pytest.mark.parametrize("background", [(0.0, 0.0), (0.0, float("nan"), 0.0), "white"])
-def test_render_names_a_bad_background(background):
-    with pytest.raises(ValueError, match="background"):
-        igsr.render(scenes.splats(), scenes.ring_camera(0.0), background, "cpu")
-
-
-def test_render_names_bad_cameras_and_backends():
-    K = np.array([[72.0, 0.0, 24.0], [0.0, 72.0, 24.0], [0.0, 0.0, 1.0]])
-    for camera, backend, word in (
-        (scenes.ring_camera(0.0), "abacus", "backend"),
-        (igsr.Camera(np.eye(4), K, 20_000, 8), "cpu", "width"),
-    ):
-        with pytest.raises(igsr.IgsrError, match=word):
-            igsr.render(scenes.splats(), camera, backend=backend)
+def test_render_names_bad_backgrounds_cameras_and_backends():
+    camera = scenes.ring_camera(0.0)
+    for background in ((0.0, 0.0), (0.0, float("nan"), 0.0), "white"):
+        assert_refused("background", igsr.render, scenes.splats(), camera, background, "cpu")
+    assert_refused("backend", igsr.render, scenes.splats(), camera, backend="abacus")
+    wide = igsr.Camera(np.eye(4), camera.K, 20_000, 8)
+    assert_refused("width", igsr.render, scenes.splats(), wide, backend="cpu")
 
 
 def test_core_names_arrays_of_the_wrong_kind():

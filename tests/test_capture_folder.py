@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from capture_files import photo, save, write_colmap, write_transforms
+from capture_files import assert_refused, photo, save, write_colmap, write_transforms
 
 from igsr.capture import load_capture
-from igsr.errors import IgsrError
 
 
 def test_file_and_folder_are_the_same_capture(tmp_path):
@@ -29,18 +28,13 @@ def test_images_folder_next_to_cameras(write, tmp_path):
 
 
 def test_no_cameras(tmp_path):
-    with pytest.raises(IgsrError, match="no images and no cameras"):
-        load_capture(tmp_path)
+    assert_refused("no images and no cameras", load_capture, tmp_path)
     path = save(tmp_path / "images/a.png", photo())
-    with pytest.raises(IgsrError, match="images folder but no cameras"):
-        load_capture(tmp_path)
-    with pytest.raises(IgsrError, match="1 images but no cameras; put a COLMAP model"):
-        load_capture(tmp_path / "images")
-    with pytest.raises(IgsrError, match=r"a\.png is no capture"):
-        load_capture(path)
+    assert_refused("images folder but no cameras", load_capture, tmp_path)
+    assert_refused("1 images but no cameras; put a COLMAP model", load_capture, tmp_path / "images")
+    assert_refused(r"a\.png is no capture", load_capture, path)
 
 
 @pytest.mark.parametrize("name", ["missing", "a\0b", "a" * 5000])
 def test_path_that_does_not_exist(name, tmp_path):
-    with pytest.raises(IgsrError, match="does not exist"):
-        load_capture(tmp_path / name)
+    assert_refused("does not exist", load_capture, tmp_path / name)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from capture_files import random_viewmats
+from capture_files import assert_refused, random_viewmats
 
 from igsr.capture import Camera, Capture, Points, PseudoView, View
 from igsr.capture.types import Tracks
@@ -22,12 +22,10 @@ def changed(matrix, row, column, value):
 
 
 def capture(names, centers=None):
-    views = []
+    views, image = [], np.zeros((2, 3, 3), dtype=np.uint8)
     for index, name in enumerate(names):
         viewmat = np.eye(4)
-        if centers is not None:
-            viewmat[:3, 3] = -centers[index]
-        image = np.zeros((2, 3, 3), dtype=np.uint8)
+        viewmat[:3, 3] = 0.0 if centers is None else -centers[index]
         views.append(View(name, Camera(viewmat, K, 3, 2), "train", image))
     return Capture(Path("capture"), views)
 
@@ -38,14 +36,12 @@ def test_camera_keeps_its_fields_and_has_a_center():
     np.testing.assert_allclose(camera.viewmat, viewmat, atol=1e-14)
     np.testing.assert_array_equal(camera.K, K)
     np.testing.assert_allclose(viewmat @ np.append(camera.center, 1.0), [0, 0, 0, 1], atol=1e-12)
-
-
-def test_rounded_rotation_becomes_exact():
-    viewmat = np.round(random_viewmats(1)[0], 4)
-    rotation = Camera(viewmat, K, 48, 32).viewmat[:3, :3]
-    assert np.abs(viewmat[:3, :3] @ viewmat[:3, :3].T - np.eye(3)).max() > 1e-6
+    # A rounded rotation becomes exact.
+    rounded = np.round(viewmat, 4)
+    rotation = Camera(rounded, K, 48, 32).viewmat[:3, :3]
+    assert np.abs(rounded[:3, :3] @ rounded[:3, :3].T - np.eye(3)).max() > 1e-6
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-14)
-    np.testing.assert_allclose(rotation, viewmat[:3, :3], atol=2e-4)
+    np.testing.assert_allclose(rotation, rounded[:3, :3], atol=2e-4)
 
 
 @pytest.mark.parametrize(
@@ -98,19 +94,12 @@ def test_a_background_is_a_color_behind_an_image_without_alpha():
 
     def view(background, channels=3):
         image = np.zeros((2, 3, channels), np.uint8)
-        return PseudoView(
-            "a.png",
-            camera,
-            "train",
-            image,
-            weights=np.ones((2, 3), np.float32),
-            background=background,
-        )
+        weights = np.ones((2, 3), np.float32)
+        return PseudoView("a.png", camera, "train", image, weights=weights, background=background)
 
     assert view((0.0, 0.5, 1.0)).background == (0.0, 0.5, 1.0)
     for background in ((0.0, 0.5), (0.0, 0.5, 1.5), (0.0, np.nan, 1.0)):
-        with pytest.raises(IgsrError, match=r"a.png: its background must be three numbers in \[0"):
-            view(background)
+        assert_refused(r"a.png: its background must be three numbers in \[0", view, background)
     with pytest.raises(IgsrError, match=r"a.png: only an image without alpha has a background"):
         view((1.0, 1.0, 1.0), channels=4)
 
@@ -125,8 +114,7 @@ def test_holdout_is_by_name_and_keeps_the_order():
     assert split.views[0].image is whole.views[0].image
     assert not whole.test_views
     for every in (0, 1, -8, 2.5, True):
-        with pytest.raises(IgsrError, match="holdout is"):
-            whole.with_holdout(every)
+        assert_refused("holdout is", whole.with_holdout, every)
     with pytest.raises(IgsrError, match="one photo only"):
         capture(["a"]).with_holdout(8)
 

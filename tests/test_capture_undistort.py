@@ -93,19 +93,14 @@ def test_pixels_outside_the_photo_are_masked_and_black():
     out = undistorter.image(np.full((HEIGHT, WIDTH, 3), 200, dtype=np.uint8))
     assert not undistorter.valid[0, 0]
     assert undistorter.valid[HEIGHT // 2, WIDTH // 2]
-    assert (out[undistorter.valid] == 200).all()
-    assert (out[~undistorter.valid] == 0).all()
+    np.testing.assert_array_equal(out[..., 0], np.where(undistorter.valid, 200, 0))
 
 
-@pytest.mark.parametrize(
-    "lens",
-    [
-        Lens(radial=(-1.5,)),
-        Lens(fisheye=True, radial=(-0.5, 0.0, 0.0, 0.0)),
-        Lens(radial=(0.0,), denominator=(-0.9,)),
-        Lens(tangential=(0.0, 0.4)),
-    ],
-)
+FOLDED = [Lens(radial=(-1.5,)), Lens(fisheye=True, radial=(-0.5, 0.0, 0.0, 0.0))]
+FOLDED += [Lens(radial=(0.0,), denominator=(-0.9,)), Lens(tangential=(0.0, 0.4))]
+
+
+@pytest.mark.parametrize("lens", FOLDED)
 def test_rays_beyond_the_fold_are_masked(lens):
     """Beyond the fold, two rays share a pixel; only the inner one may be used."""
     r = np.linspace(0.0, 5.0, 2001)

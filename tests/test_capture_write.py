@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pycolmap
 import pytest
-from capture_files import photo, random_viewmats, save
+from capture_files import assert_refused, photo, random_viewmats, save
 from capture_files import write_colmap as write_with_pycolmap
 from PIL import Image
 
@@ -191,17 +192,14 @@ def test_a_folder_is_complete_or_missing(tmp_path, monkeypatch):
     out = tmp_path / "out"
     out.mkdir()  # an empty one is allowed
     write_colmap(made_up(), out)
-    with pytest.raises(IgsrError, match="out is not empty"):
-        write_colmap(made_up(), out)
+    assert_refused("out is not empty", write_colmap, made_up(), out)
     before = (out / "sparse/0/points3D.bin").read_bytes()
 
-    def full(*arguments, **options):
-        raise OSError(28, "No space left on device")
-
+    full = Mock(side_effect=OSError(28, "No space left on device"))
     with monkeypatch.context() as patch:
         patch.setattr("igsr.capture.write_files.Image.fromarray", full)
-        with pytest.raises(IgsrError, match=r"Cannot write .*out: No space left on device"):
-            write_colmap(made_up(), out, replace=True)
+        words = "Cannot write .*out: No space left on device"
+        assert_refused(words, write_colmap, made_up(), out, replace=True)
     assert (out / "sparse/0/points3D.bin").read_bytes() == before
     capture = made_up()
     capture.points = None

@@ -1,8 +1,12 @@
 """The denoiser's network, its files and its use."""
 
+import json
+
 import numpy as np
 import pytest
 import torch
+from capture_files import assert_refused
+from safetensors.torch import load_file, save_file
 
 import igsr
 from igsr.capture import Camera
@@ -146,18 +150,19 @@ def test_renders_of_all_types_are_accepted():
     ones = np.ones((8, 9), np.float32)
     drawn = Render(floats, ones, ones, ones, 0 * ones)
     assert denoise(drawn, denoiser=cleaner)[0].shape == (8, 9, 3)
-    with pytest.raises(igsr.IgsrError, match=r"color must be \[H, W, 3\], not \[8, 9\]"):
-        denoise(floats[..., 0], denoiser=cleaner)
-    camera = Camera(np.eye(4), np.eye(3), 9, 8)
-    photo = Source(camera, floats, ones > 0.0, ones)
-    with pytest.raises(igsr.IgsrError, match=r"must be of igsr\.denoiser\.photo_sources"):
-        denoise(Buffers(floats), ["photo.png"], denoiser=cleaner)
-    with pytest.raises(igsr.IgsrError, match="photos need a render with a camera"):
-        denoise(drawn, [photo], denoiser=cleaner)
-    with pytest.raises(igsr.IgsrError, match=r"the denoiser returned a picture \[4, 9, 3\]"):
-        denoise(floats, denoiser=lambda render, _: (floats[::2], ones))
-    with pytest.raises(igsr.IgsrError, match="render must be uint8 or float"):
-        denoise(np.zeros((2, 2, 3), np.int64), denoiser=cleaner)
+    photo = Source(Camera(np.eye(4), np.eye(3), 9, 8), floats, ones > 0.0, ones)
+    for render, photos, message in (
+        (floats[..., 0], [], r"color must be \[H, W, 3\], not \[8, 9\]"),
+        (Buffers(floats), ["photo.png"], r"must be of igsr\.denoiser\.photo_sources"),
+        (drawn, [photo], "photos need a render with a camera"),
+        (np.zeros((2, 2, 3), np.int64), [], "render must be uint8 or float"),
+    ):
+        assert_refused(message, denoise, render, photos, denoiser=cleaner)
+
+    def smaller(render, photos):
+        return floats[::2], ones
+
+    assert_refused(r"returned a picture \[4, 9, 3\]", denoise, floats, denoiser=smaller)
 
 
 def test_networks_survive_files(tmp_path):
@@ -170,16 +175,12 @@ def test_networks_survive_files(tmp_path):
 
 
 def test_damaged_weights_are_refused(tmp_path):
-    from safetensors.torch import load_file, save_file
-
     path = tmp_path / "a.safetensors"
     save_network(network(), path, {})
     whole = path.read_bytes()
     weights = load_file(path)
-    about = {
-        "architecture": '{"width": 4, "blocks": [1, 1, 1], "residual": true, "buffers": true, '
-        '"photos": "concatenated"}'
-    }
+    said = {"width": 4, "blocks": [1, 1, 1], "residual": True, "buffers": True}
+    about = {"architecture": json.dumps({**said, "photos": "concatenated"})}
 
     def refused(match):
         with pytest.raises(igsr.IgsrError, match=match) as caught:
@@ -190,12 +191,10 @@ def test_damaged_weights_are_refused(tmp_path):
         path.write_bytes(whole[:length])
         refused("is not a complete .safetensors file")
     save_file(weights, path)
-    refused("does not record its architecture")
     unsaid = "does not record its architecture"
+    refused(unsaid)
     for wrong, why in (
-        ("[]", unsaid),
-        ('{"width": 4}', unsaid),
-        ("{", unsaid),
+        *((text, unsaid) for text in ("[]", '{"width": 4}', "{", "[" * 100_000)),
         ('{"width": 4, "blocks": [1, 1, 1], "code": "import os"}', unsaid),
         ('{"width": 100000, "blocks": [1, 1, 1]}', "width must be even, from 2 to 256"),
         ('{"width": 4.5, "blocks": [1, 1, 1]}', "width must be even"),
@@ -203,25 +202,21 @@ def test_damaged_weights_are_refused(tmp_path):
         ('{"width": 4, "blocks": [1, 1, 99]}', "blocks must be three from 0 to 32"),
         ('{"width": 4, "blocks": [1, 1, 1], "photos": "all"}', "photos must be one of"),
         ('{"width": 4, "blocks": [1, 1, 1], "residual": 1}', "residual must be True or False"),
-        ("[" * 100_000, unsaid),
     ):
         save_file(weights, path, metadata={"architecture": wrong})
         refused(why)
-    save_file({k: v for k, v in weights.items() if k != "head.bias"}, path, metadata=about)
-    refused("lacks the weight head.bias")
-    save_file(weights | {"head.bias": torch.zeros(3)}, path, metadata=about)
-    refused("head.bias has shape")
-    save_file(weights | {"head.bias": weights["head.bias"] * float("nan")}, path, metadata=about)
-    refused("head.bias holds a NaN")
-    save_file(weights | {"more": torch.zeros(3)}, path, metadata=about)
-    refused("has an unknown weight more")
+    for wrong, why in (
+        ({k: v for k, v in weights.items() if k != "head.bias"}, "lacks the weight head.bias"),
+        (weights | {"head.bias": torch.zeros(3)}, "head.bias has shape"),
+        (weights | {"head.bias": weights["head.bias"] * np.nan}, "head.bias holds a NaN"),
+        (weights | {"more": torch.zeros(3)}, "has an unknown weight more"),
+    ):
+        save_file(wrong, path, metadata=about)
+        refused(why)
     path.unlink()
     refused("does not exist")
 
 
 def test_missing_shipped_weights_give_advice(monkeypatch, tmp_path):
-    from igsr.denoiser import weights
-
-    monkeypatch.setattr(weights, "SHIPPED", tmp_path / "denoiser.safetensors")
-    with pytest.raises(igsr.IgsrError, match=r"without the denoiser's weights.*--weights"):
-        load_network()
+    monkeypatch.setattr("igsr.denoiser.weights.SHIPPED", tmp_path / "denoiser.safetensors")
+    assert_refused("without the denoiser's weights.*--weights", load_network)

@@ -5,17 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
+from capture_files import assert_refused
 
 import igsr
 from igsr.capture import Camera, View
-from igsr.denoiser import (
-    Buffers,
-    Source,
-    photo_sources,
-    photo_support,
-    render_buffers,
-    warping,
-)
+from igsr.denoiser import Buffers, Source, photo_sources, photo_support, render_buffers, warping
 from igsr.denoiser.inputs import BUFFERS, CHANNELS, COLOR, PHOTOS, network_inputs
 from igsr.denoiser.warping import MAX_SOURCES, Warped, warp_photos
 from igsr.evaluation.scores import BLACK
@@ -29,16 +23,8 @@ def camera(x=0.0, size=32, focal=40.0):
     return Camera(viewmat, K, size, size)
 
 
-def splats(means, scales, opacity=0.95, quats=(1.0, 0.0, 0.0, 0.0)):
-    means = np.asarray(means, np.float32)
-    n = len(means)
-    return igsr.Splats(
-        means=means,
-        quats=np.tile(np.asarray(quats, np.float32), (n, 1)),
-        scales=np.log(np.broadcast_to(np.asarray(scales, np.float32), (n, 3))),
-        opacities=np.full(n, np.log(opacity / (1 - opacity)), np.float32),
-        sh=np.full((n, 1, 3), 0.5, np.float32),
-    )
+def splats(means, scales, opacity=0.95):
+    return scenes.round_splats(means, scales, np.log(opacity / (1 - opacity)), color=0.64)
 
 
 def test_buffers_of_a_flat_splat():
@@ -60,9 +46,8 @@ def test_buffers_of_a_flat_splat():
     size = np.exp(np.log([2.0, 2.0, 0.01]).mean()) * 40.0 / 4.0
     assert buffers.footprint[middle] == pytest.approx(np.log2(size), rel=1e-4)
     assert buffers.support[middle] == pytest.approx(2.0, rel=1e-4)
-    assert all(
-        np.isfinite(array).all() for name, array in vars(buffers).items() if name != "camera"
-    )
+    arrays = [array for name, array in vars(buffers).items() if name != "camera"]
+    assert all(np.isfinite(array).all() for array in arrays)
 
 
 def test_depth_deviation_of_two_blended_surfaces():
@@ -83,10 +68,10 @@ def test_empty_pixels_are_zero():
     assert np.isfinite(network_inputs(buffers, warped_of(buffers, []))).all()
 
 
-def test_buffers_of_other_shapes_are_refused():
+def test_buffers_of_other_shapes_and_types_are_refused():
     color = np.zeros((4, 5, 3), np.float32)
-    with pytest.raises(igsr.IgsrError, match=r"^color must be \[H, W, 3\], not \[4, 5\]$"):
-        Buffers(color=color[..., 0])
+    assert_refused("color must be of floats", Buffers, color=color.astype(np.uint8))
+    assert_refused(r"^color must be \[H, W, 3\], not \[4, 5\]$", Buffers, color=color[..., 0])
     with pytest.raises(igsr.IgsrError, match=r"^alpha must be \[4, 5\] as color, not \[5, 4\]$"):
         Buffers(color=color, alpha=np.zeros((5, 4), np.float32))
     with pytest.raises(igsr.IgsrError, match="camera is of a 32x32 picture, color is 5x4"):
@@ -108,26 +93,29 @@ def source(x, z=0.0):
     return Source(camera(x), color, np.ones(depth.shape, np.bool_), depth)
 
 
+def plane_buffers():
+    color, depth = plane_photo(camera())
+    return Buffers(color, np.ones_like(depth), depth, camera=camera())
+
+
 def warped_of(buffers, sources, keep=PHOTOS):
     return warp_photos(buffers.camera, buffers.depth, buffers.alpha, sources, keep)
 
 
 def test_photos_are_warped_in_the_order_of_angles():
-    truth, depth = plane_photo(camera())
-    buffers = Buffers(truth, np.ones_like(depth), depth, camera=camera())
+    buffers = plane_buffers()
     warped = warped_of(buffers, [source(0.8), source(-0.3), source(0.5)])
     # The camera at -0.3 is nearest and sees all but a strip at one side.
     inner = warped.valid[0] & warped.valid[1]
     assert inner[:, 8:28].all()
-    assert np.abs(warped.color[0] - truth)[:, 8:28].max() < 0.01
+    assert np.abs(warped.color[0] - buffers.color)[:, 8:28].max() < 0.01
     assert np.allclose(warped.angle[0][16, 16], np.arctan(0.3 / 4.0), atol=2e-2)
     assert (warped.angle[0] <= warped.angle[1]).all()
     assert not warped.valid[0][:, :1].any() or not warped.valid[1][:, :1].any()
 
 
 def test_occluded_masked_and_missing_photos_are_not_valid():
-    truth, depth = plane_photo(camera())
-    buffers = Buffers(truth, np.ones_like(depth), depth, camera=camera())
+    buffers = plane_buffers()
     hidden = source(0.1)
     hidden.depth[:, :16] = 2.0  # something stands before the left half
     warped = warped_of(buffers, [hidden])
@@ -139,13 +127,12 @@ def test_occluded_masked_and_missing_photos_are_not_valid():
     masked.usable[:] = False
     assert not warped_of(buffers, [masked]).valid.any()
     assert not warped_of(buffers, []).valid.any()
-    transparent = Buffers(truth, np.zeros_like(depth), depth, camera=camera())
+    transparent = replace(buffers, alpha=np.zeros_like(buffers.alpha))
     assert not warped_of(transparent, [source(0.1)]).valid.any(), "there is no surface"
 
 
 def test_only_the_nearest_of_many_photos_are_warped():
-    truth, depth = plane_photo(camera())
-    buffers = Buffers(truth, np.ones_like(depth), depth, camera=camera())
+    buffers = plane_buffers()
     near = [source(x) for x in np.linspace(-0.4, 0.4, MAX_SOURCES)]
     far = [source(x) for x in (-1.2, 1.2, 1.5)]
     few, many = warped_of(buffers, near, 3), warped_of(buffers, [far[0], *near, *far[1:]], 3)
@@ -177,8 +164,7 @@ def test_the_background_is_an_input():
     assert np.allclose(inputs[at : at + 5, 0, 0], [0.2, 0.4, 0.6, 1.0, 0.0])
     assert np.ptp(inputs[at:], axis=(1, 2)).max() == 0.0, "the same everywhere"
     assert not network_inputs(Buffers(color), nothing_warped(8, 8))[at:].any()
-    with pytest.raises(igsr.IgsrError, match=r"background must be \[3\], not \[2\]"):
-        Buffers(color, background=behind[:2])
+    assert_refused(r"background must be \[3\], not \[2\]", Buffers, color, background=behind[:2])
 
 
 def test_buffers_have_the_background():
@@ -228,17 +214,7 @@ def test_no_splats_give_an_empty_picture():
 
 def test_a_far_pixel_does_not_change_other_depths():
     depth = np.full((8, 8), 2.0, np.float32)
-    depth[0, 0] = 1e5
-    depth[0, 1] = 0.0
-    depth[3, 3] = 4.0
-    nothing = Warped(np.zeros((0, 8, 8, 3)), np.zeros((0, 8, 8), bool), np.zeros((0, 8, 8)))
+    depth[0, :2], depth[3, 3] = [1e5, 0.0], 4.0
     buffers = Buffers(color=np.zeros((8, 8, 3), np.float32), depth=depth)
-    channel = network_inputs(buffers, nothing)[4]
-    assert channel[3, 3] == pytest.approx(1.0)
-    assert channel[3, 4] == 0.0
-    assert channel[0, 1] == 0.0
-
-
-def test_bytes_are_refused_as_color():
-    with pytest.raises(igsr.IgsrError, match="color must be of floats"):
-        Buffers(color=np.zeros((8, 8, 3), np.uint8))
+    channel = network_inputs(buffers, nothing_warped(8, 8))[4]
+    assert channel[[3, 3, 0], [3, 4, 1]] == pytest.approx([1.0, 0.0, 0.0])

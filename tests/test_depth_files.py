@@ -36,14 +36,6 @@ def depths(folder):
     return [view.depth for view in load_capture(folder).views]
 
 
-def test_arrays_are_in_world_units(tmp_path):
-    with_depth(tmp_path, "1.npy", DEPTH)
-    first, second, third = depths(tmp_path)
-    assert first is third is None
-    assert second.dtype == np.float32
-    assert np.array_equal(second, DEPTH)
-
-
 @pytest.mark.parametrize(("name", "unit"), [("1.png", None), ("1.npy", None), ("1.tif", 0.25)])
 def test_whole_numbers_are_millimeters_by_default(name, unit, tmp_path):
     stored = np.round(DEPTH * 1000.0).astype(np.uint16)
@@ -64,13 +56,15 @@ def test_channel_z_of_an_exr(tmp_path):
             load_capture(tmp_path)
 
 
-def test_impossible_depths_are_unknown(tmp_path):
+def test_arrays_are_in_world_units_and_impossible_depths_unknown(tmp_path):
     stored = DEPTH.astype(np.float64)
     stored.ravel()[:6] = [np.nan, np.inf, -np.inf, 0.0, -2.0, 1e300]
     with_depth(tmp_path, "1.npy", stored)
-    depth = depths(tmp_path)[1].ravel()
-    assert (depth[:6] == 0.0).all()
-    assert np.array_equal(depth[6:], DEPTH.ravel()[6:])
+    first, second, third = depths(tmp_path)
+    assert first is third is None
+    assert second.dtype == np.float32
+    assert (second.ravel()[:6] == 0.0).all()
+    assert np.array_equal(second.ravel()[6:], DEPTH.ravel()[6:])
 
 
 @pytest.mark.parametrize("size", [(HEIGHT // 2, WIDTH // 2), (2 * HEIGHT, 2 * WIDTH)])

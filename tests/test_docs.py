@@ -8,10 +8,8 @@ are parsed at least.
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import functools
-import importlib.util
 import io
 import itertools
 import json
@@ -21,14 +19,14 @@ import runpy
 import shutil
 import subprocess
 import sys
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
-from typing import Any
 
 import documentation
 import numpy as np
 import pytest
 import rooms
-from documentation import DOCS, PAGES, ROOT, TYPED, Block
+from documentation import DOCS, PAGES, ROOT, TYPED
 from PIL import Image
 from typer.main import get_command
 
@@ -69,7 +67,7 @@ NAMING = ("py", "crates", "tests", "examples")
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_links_and_pictures_lead_somewhere(page: str) -> None:
+def test_links_and_pictures_lead_somewhere(page):
     folder, shown = (ROOT / page).parent, documentation.SHOWN
     wrong = []
     for target in documentation.links(page):
@@ -90,7 +88,7 @@ def test_links_and_pictures_lead_somewhere(page: str) -> None:
     assert not wrong
 
 
-def test_sources_name_pages_that_exist() -> None:
+def test_sources_name_pages_that_exist():
     wrong = []
     for folder in NAMING:
         for path in (ROOT / folder).rglob("*"):
@@ -103,15 +101,10 @@ def test_sources_name_pages_that_exist() -> None:
     assert not wrong
 
 
-def test_the_site_builds_without_a_warning_and_has_every_command(tmp_path: Path) -> None:
-    built = subprocess.run(
-        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")],
-        cwd=ROOT,
-        env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+def test_the_site_builds_without_a_warning_and_has_every_command(tmp_path):
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", tmp_path / "site"]
+    env = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    built = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True)
     assert built.returncode == 0, built.stdout + built.stderr
     page = (tmp_path / "site" / "reference" / "command-line.html").read_text(encoding="utf-8")
     for name in (name for name in _commands_by_name() if name.startswith("igsr")):
@@ -123,16 +116,12 @@ def test_the_site_builds_without_a_warning_and_has_every_command(tmp_path: Path)
 
 
 @functools.cache
-def _commands_by_name() -> dict[str, Any]:
-    spec = importlib.util.spec_from_file_location(
-        "command_line_page", DOCS / "_site" / "command_line_page.py"
-    )
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return {**dict(module.walk()), **dict(module.walk("lab", lab.app))}
+def _commands_by_name():
+    walk = runpy.run_path(DOCS / "_site" / "command_line_page.py")["walk"]
+    return {**dict(walk()), **dict(walk("lab", lab.app))}
 
 
-def _commands(block: Block) -> list[list[str]]:
+def _commands(block):
     """The commands of a block, with "lab" for "python -m igsr_lab"."""
     return [
         ["lab", *words[3:]] if words[:3] == ["python", "-m", "igsr_lab"] else words
@@ -140,7 +129,7 @@ def _commands(block: Block) -> list[list[str]]:
     ]
 
 
-def _without_process_options(words: list[str]) -> list[str]:
+def _without_process_options(words):
     """The words without what stands between "igsr" and the command: "--threads 1", "-v" ..."""
     rest = words[1:]
     while rest and rest[0] in PROCESS_OPTIONS:
@@ -148,7 +137,7 @@ def _without_process_options(words: list[str]) -> list[str]:
     return [words[0], *rest]
 
 
-def _named_command(words: list[str]) -> tuple[str, Any]:
+def _named_command(words):
     """The command that words such as "python -m igsr_lab study table2 DATA" name, and its name."""
     known = _commands_by_name()
     words = _without_process_options(words)
@@ -159,13 +148,13 @@ def _named_command(words: list[str]) -> tuple[str, Any]:
     return name, known[name]
 
 
-def _options(command: Any) -> set[str]:
+def _options(command):
     inner = getattr(command, "commands", {}).values()
     own = {opt for p in command.params for opt in (*p.opts, *p.secondary_opts)}
     return own.union({"--help"}, *(_options(one) for one in inner))
 
 
-def _unknown_options(words: list[str]) -> list[str]:
+def _unknown_options(words):
     name, command = _named_command(words)
     if name == "igsr view":
         return []  # the rest is splat-view's
@@ -174,10 +163,10 @@ def _unknown_options(words: list[str]) -> list[str]:
     return [option for option in given if option not in _options(command)]
 
 
-def _parse(words: list[str]) -> None:
+def _parse(words):
     """Fails where the command line does not take the words."""
 
-    def below(command: Any, name: str, rest: list[str], parent: Any) -> None:
+    def below(command, name, rest, parent):
         context = command.make_context(name, rest, parent=parent)
         if getattr(command, "commands", None):
             rest = [*getattr(context, "_protected_args", []), *context.args]
@@ -188,7 +177,7 @@ def _parse(words: list[str]) -> None:
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if page != "CHANGELOG.md"])
-def test_commands_and_options_exist(page: str) -> None:
+def test_commands_and_options_exist(page):
     """In blocks and in the text, also where they have placeholders."""
     wrong = []
     code = [span.replace("python -m igsr_lab", "lab") for span in documentation.inline_code(page)]
@@ -213,16 +202,15 @@ def test_commands_and_options_exist(page: str) -> None:
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if page not in OTHER_OPTIONS])
-def test_options_in_the_text_exist(page: str) -> None:
-    known = OF_OTHERS.union(
-        _options(get_command(app)), *(_options(command) for command in _commands_by_name().values())
-    )
+def test_options_in_the_text_exist(page):
+    commands = [get_command(app), *_commands_by_name().values()]
+    known = OF_OTHERS.union(*map(_options, commands))
     spans = [span for span in documentation.inline_code(page) if span.startswith("--")]
     named = [word for span in spans for word in re.findall(r"(?<!\S)--[a-z][\w-]*", span)]
     assert [option for option in named if option not in known] == []
 
 
-def _shell(block: Block) -> list[list[str]]:
+def _shell(block):
     try:
         return _commands(block)
     except ValueError:
@@ -233,7 +221,7 @@ def _shell(block: Block) -> list[list[str]]:
 # ---- code blocks -------------------------------------------------------------------------------
 
 
-def test_blocks_that_are_not_run_are_few_and_say_why() -> None:
+def test_blocks_that_are_not_run_are_few_and_say_why():
     told = [block for page in TYPED for block in documentation.blocks(page) if block.not_run]
     for block in told:
         print(f"{block.place} is not run: {block.not_run}")
@@ -245,8 +233,8 @@ def test_blocks_that_are_not_run_are_few_and_say_why() -> None:
 
 
 @pytest.mark.parametrize("page", TYPED)
-def test_code_blocks_run(page: str, world: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    names: dict[str, Any] = {"__name__": "__main__"}
+def test_code_blocks_run(page, world, capsys):
+    names = {"__name__": "__main__"}
     ran = 0
     for block in documentation.blocks(page):
         if block.not_run or block.language == "text":
@@ -264,15 +252,12 @@ def test_code_blocks_run(page: str, world: Path, capsys: pytest.CaptureFixture[s
     assert ran or page in {"docs/index.md", *NOT_RUN}, "a guide without a block to run"
 
 
-def _run(words: list[str], place: str) -> None:
+def _run(words, place):
     if words[0] in ("igsr", "lab"):
         said = io.StringIO()
-        with (
-            contextlib.redirect_stdout(said),
-            contextlib.redirect_stderr(said),
-            pytest.raises(SystemExit) as ended,
-        ):
-            (app if words[0] == "igsr" else lab.app)(_shortened(words, place))
+        run = app if words[0] == "igsr" else lab.app
+        with redirect_stdout(said), redirect_stderr(said), pytest.raises(SystemExit) as ended:
+            run(_shortened(words, place))
         assert not ended.value.code, f"{place}: {' '.join(words)}\n{said.getvalue()}"
     elif words[0] == "python":
         before, sys.argv = sys.argv, _shortened(words, place)
@@ -284,7 +269,7 @@ def _run(words: list[str], place: str) -> None:
         raise AssertionError(f"{place}: {words[0]} is not run here; mark the block")
 
 
-def _shortened(words: list[str], place: str) -> list[str]:
+def _shortened(words, place):
     """The arguments of a command, with few steps and frames."""
     short = {**SHORT, "--rounds": "1"} if place.startswith(WITH_A_ROUND) else SHORT
     given = [short.get(before, word) for before, word in itertools.pairwise(words)]
@@ -296,7 +281,7 @@ def _shortened(words: list[str], place: str) -> list[str]:
 
 
 @pytest.fixture(scope="session")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made(tmp_path_factory):
     """What the pages name: ``photos`` without cameras, and ``examples`` with a tiny capture."""
     folder = tmp_path_factory.mktemp("docs")
     (folder / "photos").mkdir()
@@ -319,34 +304,28 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def world(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def world(made, tmp_path, monkeypatch):
     """A folder to run a page in, where fits are short."""
     shutil.copytree(made, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
-    for name in ("fit", "refine", "compact"):
-        monkeypatch.setattr(igsr, name, _short(getattr(igsr, name)))
+    short = {"steps": int(SHORT["--steps"])}
+    _shorten(monkeypatch, "compact", short)
+    _shorten(monkeypatch, "fit", {**short, "max_splats": int(SHORT["--max-splats"])})
+    _shorten(monkeypatch, "refine", {**short, "rounds": int(SHORT["--rounds"])})
     monkeypatch.setattr(Colmap, "__call__", _looked_for_once(Colmap.__call__))
     return tmp_path
 
 
-def _short(function: Any) -> Any:
-    @functools.wraps(function)
-    def shorter(*arguments: Any, **options: Any) -> Any:
-        options["steps"] = int(SHORT["--steps"])
-        if function.__name__ == "refine":
-            options["rounds"] = int(SHORT["--rounds"])
-        if function.__name__ == "fit":
-            options["max_splats"] = int(SHORT["--max-splats"])
-        return function(*arguments, **options)
-
-    return shorter
+def _shorten(monkeypatch, name, short):
+    function = getattr(igsr, name)
+    monkeypatch.setattr(igsr, name, lambda *args, **given: function(*args, **{**given, **short}))
 
 
-_FOUND: dict[tuple[Any, ...], Any] = {}
+_FOUND = {}
 
 
-def _looked_for_once(function: Any) -> Any:
-    def remembered(self: Colmap, photos: Any, **options: Any) -> Any:
+def _looked_for_once(function):
+    def remembered(self, photos, **options):
         key = (options.get("seed"), *((photo.name, photo.image.tobytes()) for photo in photos))
         if key not in _FOUND:
             _FOUND[key] = function(self, photos, **options)

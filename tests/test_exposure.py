@@ -10,6 +10,7 @@ import pytest
 import refinements
 import scenes
 import torch
+from capture_files import assert_refused
 from made_up_tracks import tracked
 from PIL import Image
 
@@ -30,7 +31,7 @@ from igsr.fitting.fitter import fitter_of, splat_arrays, without_exposures
 from igsr.refinement.cut_highlights import with_cut_highlights
 
 
-def with_exposure(view: View, exposure: Exposure) -> View:
+def with_exposure(view, exposure):
     """The photo with an exposure applied to its colors."""
     colors = exposure.apply_to(view.image[..., :3].astype(np.float32) / 255.0)
     pixels = np.floor(np.clip(colors, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
@@ -149,11 +150,9 @@ def test_impossible_exif_is_ignored(tmp_path):
             return read_exif(opened).exposure_value
 
     assert value(time=1 / 64, f=4.0, iso=400) == pytest.approx(-6 - 4 + 2, abs=1e-3)
-    assert value(time=0.0, f=4.0, iso=400) is None
-    assert value(time=1 / 64, f=0.0, iso=400) is None
-    assert value(time=1 / 64, f=4.0, iso=0) is None
-    assert value(time=1 / 64, f=4.0) is None
-    assert value() is None
+    for wrong in ({"time": 0.0}, {"f": 0.0}, {"iso": 0}):
+        assert value(**{"time": 1 / 64, "f": 4.0, "iso": 400, **wrong}) is None
+    assert value(time=1 / 64, f=4.0) is value() is None
 
 
 def test_taking_an_exposure_out_undoes_it():
@@ -165,8 +164,7 @@ def test_taking_an_exposure_out_undoes_it():
     with_alpha = exposure.remove_from(np.concatenate([view.image, alpha], axis=2))
     assert (with_alpha[..., 3] == 77).all()
     for bad in ({"gain": (1.0, 0.0, 1.0)}, {"gain": (1.0, 2.0)}, {"offset": (0.0, np.nan, 0.0)}):
-        with pytest.raises(igsr.IgsrError, match=next(iter(bad))):
-            Exposure(**bad)
+        assert_refused(next(iter(bad)), Exposure, **bad)
 
 
 @pytest.fixture(scope="module")
@@ -204,10 +202,8 @@ def test_a_fit_finds_exposures_and_the_colors_of_the_mean_photo(alpha, seed):
     # Fitted photos are scored with their exposures, held-out ones without.
     assert all(view.exposure is None for view in on.capture.test_views)
     bare = Capture(capture.path, [replace(view, exposure=None) for view in on.capture.views])
-    with_them, without = (
-        igsr.evaluate(on.splats, scored, "train", backend="cpu").psnr
-        for scored in (on.capture, bare)
-    )
+    scores = (igsr.evaluate(on.splats, c, "train", backend="cpu") for c in (on.capture, bare))
+    with_them, without = (score.psnr for score in scores)
     assert with_them > without + 2.0
 
 
@@ -263,18 +259,15 @@ def test_apply_exposure_matches_the_renderer():
     assert (clipped == 1.0).all()
     (clipped * torch.tensor([[[1.0], [-1.0]]])).sum().backward()
     assert white.grad[0, :, 0].tolist() == [2.0, 0.0]
-    with pytest.raises(igsr.IgsrError, match="gain must have shape"):
-        igsr.apply_exposure(image, gain[:1], offset)
-    with pytest.raises(igsr.IgsrError, match="image must have shape"):
-        igsr.apply_exposure(image[..., :2], gain, offset)
+    assert_refused("gain must have shape", igsr.apply_exposure, image, gain[:1], offset)
+    assert_refused("image must have shape", igsr.apply_exposure, image[..., :2], gain, offset)
 
 
 def test_a_view_with_an_exposure_is_rendered_with_it(capture):
     splats, view = scenes.splats(), capture.views[0]
     exposure = Exposure((1.3, 1.0, 0.8), (0.05, 0.0, 0.0))
-    plain, seen = (
-        render_of(splats, replace(view, exposure=e), (0, 0, 0)) for e in (None, exposure)
-    )
+    views = (replace(view, exposure=one) for one in (None, exposure))
+    plain, seen = (render_of(splats, one, (0, 0, 0)) for one in views)
     expected = with_exposure(replace(view, image=plain), exposure).image
     assert np.abs(seen.astype(int) - expected).max() <= 2
 
@@ -294,19 +287,16 @@ def test_a_refinement_uses_photos_without_their_exposures(ball_photos, rendered)
     photos = with_exposures(ball_photos, exposures)
     train = [replace(v, exposure=e) for v, e in zip(photos.train_views, exposures, strict=True)]
     photos = Capture(photos.path, [*train, *photos.test_views])
+    both = ball_photos, photos
     refined = refinements.refine(photos, 1, refinements.lying, exposure="auto")
     refinements.refine(photos, 1, refinements.lying, exposure="auto", cross_validate=False)
     assert [model.name for model in rendered] == ["fold0", "fold1", "fold2", "whole"]
-    true, given = (
-        {view.name: view.image[..., :3] for view in c.views} for c in (ball_photos, photos)
-    )
+    true, given = ({v.name: v.image[..., :3].astype(int) for v in c.views} for c in both)
     for view in (view for model in rendered for view in model.photos):
-        colors = given[view.name].astype(int)
+        colors = given[view.name]
         unclipped = (colors > 0) & (colors < 255)
-        after, before = (
-            np.abs(image.astype(int) - true[view.name])[unclipped].mean()
-            for image in (view.image[..., :3], colors)
-        )
+        errors = (np.abs(one - true[view.name]) for one in (view.image[..., :3], colors))
+        after, before = (error[unclipped].mean() for error in errors)
         assert after < 0.5 * before
         assert view.exposure is None
     assert all(view.exposure is not None for view in refined.capture.train_views)
@@ -320,10 +310,8 @@ def test_clipped_highlights_are_as_bright_as_the_fit_shows(gain):
     views, true = [], []
     for view in scenes.capture(views=3, scene=model).views:
         color = igsr.render(model, view.camera, backend="cpu").color
-        image, exposed = (
-            np.clip(255.0 * colors + 0.5, 0.0, 255.0).astype(np.uint8)
-            for colors in (color, exposure.apply_to(color))
-        )
+        pixels = np.clip(255.0 * np.stack([color, exposure.apply_to(color)]) + 0.5, 0.0, 255.0)
+        image, exposed = pixels.astype(np.uint8)
         views.append(replace(view, image=exposed, exposure=exposure))
         true.append(image.astype(int))
     plain = without_exposures(views, [exposure] * 3)

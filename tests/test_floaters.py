@@ -188,20 +188,15 @@ def test_an_isolated_splat_is_alone(scale):
     assert np.flatnonzero(found).tolist() == [400]
 
 
-def test_large_distant_splats_are_not_alone():
+def test_large_distant_splats_are_not_alone_and_extreme_positions_do_not_overflow():
     far = round_splats([[0.0, 0.0, 30.0], [20.0, 0.0, 30.0]], size=15.0)
     assert not alone(joined([plane(), far])).any()
-
-
-def test_extreme_positions_do_not_overflow():
     hard = joined([plane(), round_splats([[3e38, -3e38, 0.0], [0.0, 0.0, 1.0]])])
     hard.scales[400:] = [[88.0], [-69.0]]
     found = alone(hard)
     assert found[401]
     assert not found[:400].any()
-
-
-def test_a_scene_of_isolated_splats_is_kept():
+    # A scene of isolated splats is kept.
     lonely = round_splats([[10.0 * k, 0.0, 0.0] for k in range(30)])
     assert alone(lonely).all()
     assert not stray_splats(lonely)["alone"].any()
@@ -234,15 +229,11 @@ def test_removal_by_photos_keeps_the_order():
     assert np.array_equal(cleaned.splats.origin, model.origin)
 
 
-def test_a_scene_of_floaters_only_is_kept():
+def test_a_scene_of_floaters_only_is_kept_and_a_capture_without_train_views_refused():
     capture = scenes.capture(views=4)
     cleaned = igsr.remove_floaters(round_splats([[0.0, 40.0, 0.0]]), capture, backend="cpu")
     assert len(cleaned.splats) == 1
     assert cleaned.removed == {"unseen": 0, "masked": 0, "floating": 0}
-
-
-def test_a_capture_without_train_views_is_refused():
-    capture = scenes.capture(views=4)
     nothing = replace(capture, views=capture.test_views)
     with pytest.raises(igsr.IgsrError, match="no train views"):
         igsr.remove_floaters(BALL, nothing, backend="cpu")
@@ -259,10 +250,8 @@ def test_fits_remove_and_count_floaters(tmp_path, seed):
     assert whole.removed == {}
     kinds = unsupported_splats(whole.splats, capture.train_views, BLACK, seed=seed, backend="cpu")
     # Checkpoints keep floaters, since they are removed after the last step.
-    for result in (
-        fit_capture(capture, **options),
-        fit_capture(capture, checkpoint=path, resume=True, **options),
-    ):
+    for checkpoint in ({}, {"checkpoint": path, "resume": True}):
+        result = fit_capture(capture, **checkpoint, **options)
         assert result.removed == {name: int(kind.sum()) for name, kind in kinds.items()}
         assert result.removed["unseen"] > 0
         assert result.splats == subset(whole.splats, ~np.any(list(kinds.values()), axis=0))
@@ -309,22 +298,17 @@ def test_clean_without_photos_removes_stray_splats(tmp_path):
     assert igsr.Splats.load(tmp_path / "scene.clean.ply") == plane()
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--holdout", "4"], "--holdout needs photos; give --capture"),
-        (["--max-size", "64"], "--max-size needs photos; give --capture"),
-        (["--capture", "nowhere"], "nowhere"),
-        (["--out", "scene.xyz"], "scene.xyz"),
-    ],
-)
-def test_clean_refuses_bad_arguments(scene, words, message):
+def test_clean_refuses_bad_arguments(scene):
     path, _ = scene
     before = sorted(path.parent.iterdir())
-    result = command(path, *words)
-    assert result.exit_code == 1
-    assert message in result.stderr
-    assert sorted(path.parent.iterdir()) == before
-    result = command(path.parent / "none.ply")
-    assert result.exit_code == 1
-    assert "none.ply" in result.stderr
+    for words, message in (
+        ([path, "--holdout", "4"], "--holdout needs photos; give --capture"),
+        ([path, "--max-size", "64"], "--max-size needs photos; give --capture"),
+        ([path, "--capture", "nowhere"], "nowhere"),
+        ([path, "--out", "scene.xyz"], "scene.xyz"),
+        ([path.parent / "none.ply"], "none.ply"),
+    ):
+        result = command(*words)
+        assert result.exit_code == 1
+        assert message in result.stderr
+        assert sorted(path.parent.iterdir()) == before

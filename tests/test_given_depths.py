@@ -39,10 +39,9 @@ def room(angles, held_out, width=96, height=72):
 
 def with_views(capture, change):
     """The capture with ``change(index, view)`` applied to its train views."""
-    views = [
-        change(k, view) if view.split == "train" else view for k, view in enumerate(capture.views)
-    ]
-    return replace(capture, views=views)
+    views = enumerate(capture.views)
+    changed = [change(k, view) if view.split == "train" else view for k, view in views]
+    return replace(capture, views=changed)
 
 
 def with_factors(capture, factors):
@@ -62,8 +61,7 @@ def without_depths(capture):
 
 def off_walls(xyz):
     """Distances of points to the nearest wall."""
-    normals = np.array([wall[0] for wall in rooms.WALLS])
-    offsets = np.array([wall[1] for wall in rooms.WALLS])
+    normals, offsets = (np.array([wall[k] for wall in rooms.WALLS]) for k in (0, 1))
     lengths = np.linalg.norm(normals, axis=1)
     return np.abs((xyz @ normals.T - offsets) / lengths).min(axis=1)
 
@@ -81,16 +79,11 @@ def test_points_of_exact_depths_are_on_the_walls(made):
         assert confidence is None
 
 
-def test_a_fit_starts_from_depths(made):
-    assert have_depths(made.train_views)
-    assert chosen_start(made) == "depths"
+def test_a_fit_starts_from_depths_if_half_of_the_photos_have_them(made):
     splats, start = initial_splats(made, 0, 2000, 0)
-    assert start == "depths"
+    assert chosen_start(made) == start == "depths"
     assert len(splats) == 1000  # density control adds the rest
     assert off_walls(splats.means + splats.origin).max() < 1e-3
-
-
-def test_half_of_the_photos_must_have_depths(made):
     # The train photos are 0, 2, 3 and 5.
     assert have_depths(with_factors(made, {0: None, 2: None}).train_views)
     assert not have_depths(with_factors(made, {0: None, 2: None, 3: None}).train_views)
@@ -109,9 +102,8 @@ def test_masked_transparent_and_uncertain_pixels_have_no_points(made):
         image = np.concatenate([view.image, alpha], -1)
         return replace(view, depth=depth, mask=mask, depth_confidence=confidence, image=image)
 
-    world, _, confidence = given_points(
-        with_views(made, spoiled).train_views, 3000, np.random.default_rng(0)
-    )
+    views = with_views(made, spoiled).train_views
+    world, _, confidence = given_points(views, 3000, np.random.default_rng(0))
     assert len(world) == 3000
     assert off_walls(world).max() < 1e-5
     assert (confidence == 1.0).all()
@@ -214,11 +206,14 @@ def test_depths_of_something_else_are_left_out(made):
     assert [view.depth is None for view in views] == [False, True, True, False, True, False]
 
 
-def test_a_fit_scales_depths(made):
+def test_a_fit_scales_depths_and_leaves_out_wrong_ones(made):
     points = points_of(made)
     scaled = with_factors(made, dict.fromkeys(range(6), 0.1))
-    splats = fit(replace(scaled, points=points), steps=30)
-    assert np.median(off_walls(splats.means + splats.origin)) < 0.1
+    fits = [fit(replace(scaled, points=points), steps=30)]
+    with pytest.warns(UserWarning, match="contradicts"):
+        fits.append(fit(with_factors(made, {2: 1.6}), steps=30))
+    for splats in fits:
+        assert np.median(off_walls(splats.means + splats.origin)) < 0.1
 
 
 def depths_left_out(capture):
@@ -249,21 +244,14 @@ def test_hidden_surfaces_are_no_contradiction():
     # Photos of both sides of a wall: each sees the points of the far side behind its surface.
     behind = np.diag([-1.0, 1.0, -1.0, 1.0])
     behind[2, 3] = 6.0  # 6 units away, looking back
+    K = np.array([[40.0, 0, 20], [0, 40, 15], [0, 0, 1]])
+    # Walls at z = 2 and z = 4 of the first camera.
+    image, depth = np.zeros((30, 40, 3), np.uint8), np.full((30, 40), 2.0, "f4")
     views = []
     for k, viewmat in enumerate([np.eye(4), np.eye(4), behind, behind]):
-        moved = viewmat.copy()
-        moved[0, 3] += 0.1 * k
-        camera = igsr.Camera(moved, np.array([[40.0, 0, 20], [0, 40, 15], [0, 0, 1]]), 40, 30)
-        image = np.zeros((30, 40, 3), np.uint8)
-        # Walls at z = 2 and z = 4 of the first camera.
-        views.append(View(f"{k}.png", camera, "train", image, depth=np.full((30, 40), 2.0, "f4")))
+        camera = igsr.Camera(viewmat + np.diag([0.1 * k], 3), K, 40, 30)
+        views.append(View(f"{k}.png", camera, "train", image, depth=depth))
     assert all(a is b for a, b in zip(with_consistent_depths(views), views, strict=True))
-
-
-def test_a_fit_leaves_out_a_photos_wrong_depths(made):
-    with pytest.warns(UserWarning, match="contradicts"):
-        splats = fit(with_factors(made, {2: 1.6}), steps=30)
-    assert np.median(off_walls(splats.means + splats.origin)) < 0.1
 
 
 # ---- depths of networks --------------------------------------------------------------------------
@@ -275,8 +263,12 @@ def written_and_read(found, folder):
     return read_cameras_file(folder / "cameras.npz").found
 
 
-def test_trusted_depths_of_an_estimator_are_kept_with_the_photos(made, tmp_path):
-    photos = [Photo(view.name, view.image, None, None, "phone") for view in made.views]
+@pytest.fixture
+def photos(made):
+    return [Photo(view.name, view.image, None, None, "phone") for view in made.views]
+
+
+def test_trusted_depths_of_an_estimator_are_kept_with_the_photos(made, photos, tmp_path):
     grid = Grid(34, 44, 2.0, 2.0, 6.0, 2.0)
     column, row = grid.photo_pixels().astype(int).T
     depths = [rooms.depth(view.camera)[row, column].reshape(34, 44) for view in made.views]
@@ -303,8 +295,7 @@ def test_trusted_depths_of_an_estimator_are_kept_with_the_photos(made, tmp_path)
     assert all(view.depth is None for view in old.capture(Path("room"), photos).views)
 
 
-def test_damaged_kept_depths_are_refused(made, tmp_path):
-    photos = [Photo(view.name, view.image, None, None, "phone") for view in made.views]
+def test_damaged_kept_depths_are_refused(made, photos, tmp_path):
     cameras, nothing = [view.camera for view in made.views], [None] * len(photos)
     for bad in (np.full((3, 4), np.nan, np.float32), np.ones((3, 4)), np.ones(7, np.float32)):
         estimate = Estimate(cameras, None, list(nothing), nothing, [])

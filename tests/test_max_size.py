@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
-from capture_files import HEIGHT, WIDTH, photo, save, write_colmap, write_transforms
+from capture_files import HEIGHT, WIDTH, assert_refused, photo, save, write_colmap, write_transforms
+from made_up_tracks import projected
 from PIL import Image
 
 from igsr.capture import Camera, View, load_capture
@@ -93,12 +94,9 @@ def test_halved_views_have_mean_pixels_and_the_same_projection():
     half = halved(view(image))
     assert half.image.shape == (3, 3, 3)  # an odd edge is left out
     assert half.image[1, 2, 0] == round(image[2:4, 4:6, 0].mean() + 1e-9)
-    point = np.array([0.1, -0.2, 0.3])
-    local = [
-        v.camera.viewmat[:3, :3] @ point + v.camera.viewmat[:3, 3] for v in (half, view(image))
-    ]
-    small, full = half.camera.K @ local[0], view(image).camera.K @ local[1]
-    assert np.allclose(small[:2] / small[2], full[:2] / full[2] / 2.0)
+    point = np.array([[0.1, -0.2, 0.3]])
+    small, full = (projected(v.camera, point) for v in (half, view(image)))
+    assert np.allclose(small, full / 2.0)
 
 
 def test_transparent_and_masked_pixels_of_halved_views_lend_no_color():
@@ -138,12 +136,11 @@ def test_a_fit_accepts_odd_photos():
 def test_a_reduced_capture_projects_to_the_same_places(tmp_path):
     write_transforms(tmp_path)
     whole, small = load_capture(tmp_path), load_capture(tmp_path, max_size=31)
-    points = np.random.default_rng(0).normal(size=(3, 50)) + [[0.0], [0.0], [4.0]]
     for before, after in zip(whole.views, small.views, strict=True):
         assert (after.camera.width, after.camera.height) == (31, 21)
         np.testing.assert_array_equal(after.image, area_means(before.image, 31, 21)[0])
-        full, reduced = ((v.camera.K @ points)[:2] / points[2] for v in (before, after))
-        np.testing.assert_allclose(reduced, full * [[31 / WIDTH], [21 / HEIGHT]], atol=1e-9)
+        scale = [[31 / WIDTH], [21 / HEIGHT], [1.0]]
+        np.testing.assert_allclose(after.camera.K, before.camera.K * scale, atol=1e-9)
         np.testing.assert_array_equal(after.camera.viewmat, before.camera.viewmat)
     for size in (WIDTH, 1000):
         assert load_capture(tmp_path, max_size=size) == whole
@@ -224,11 +221,8 @@ def test_photos_of_different_sizes(tmp_path):
     sizes = [(48, 32), (49, 32), (1, 1)]
     for index, size in enumerate(sizes):
         save(tmp_path / f"{index}.png", photo(index, *size))
-    for max_size, expected in (
-        (1000, sizes),
-        (24, [(24, 16), (24, 16), (1, 1)]),
-        (1, [(1, 1)] * 3),
-    ):
+    halves = [(24, 16), (24, 16), (1, 1)]
+    for max_size, expected in ((1000, sizes), (24, halves), (1, [(1, 1)] * 3)):
         photos = read_photos(tmp_path, max_size=max_size)
         assert [photo.image.shape[1::-1] for photo in photos] == expected
 
@@ -276,28 +270,23 @@ def test_a_model_without_full_photos(tmp_path):
     (tmp_path / "images_2/1.png").unlink()
     assert load_capture(tmp_path).views[0].camera.width == 12  # the next complete folder
     (tmp_path / "images_4/1.png").unlink()
-    with pytest.raises(IgsrError, match=r"images_2/1\.png is missing; put the photo there"):
-        load_capture(tmp_path)
+    assert_refused(r"images_2/1\.png is missing; put the photo there", load_capture, tmp_path)
 
 
-@pytest.mark.parametrize("rounding", [0, 1, -1])
-def test_rounded_sizes_scale_exactly(tmp_path, rounding):
+def test_rounded_sizes_scale_exactly_and_others_are_refused(tmp_path):
     write_colmap(tmp_path)
-    reduced_folder(tmp_path, 4, rounding)
-    camera = load_capture(tmp_path / "images_4").views[0].camera
-    assert (camera.width, camera.height) == (12 + rounding, 8 + rounding)
-    scale = [[camera.width / WIDTH], [camera.height / HEIGHT], [1.0]]
-    np.testing.assert_allclose(camera.K, load_capture(tmp_path).views[0].camera.K * scale)
-
-
-def test_photos_of_another_size_are_refused(tmp_path):
-    write_colmap(tmp_path)
+    full = load_capture(tmp_path).views[0].camera.K
+    for rounding in (0, 1, -1):
+        reduced_folder(tmp_path, 4, rounding)
+        camera = load_capture(tmp_path / "images_4").views[0].camera
+        assert (camera.width, camera.height) == (12 + rounding, 8 + rounding)
+        scale = [[camera.width / WIDTH], [camera.height / HEIGHT], [1.0]]
+        np.testing.assert_allclose(camera.K, full * scale)
     reduced_folder(tmp_path, 4, 2)
     with pytest.raises(IgsrError, match=r"is 14x10 pixels but .* is 48x32, and images_4 says"):
         load_capture(tmp_path / "images_4")
     save(tmp_path / "images/0.png", photo(0, WIDTH - 1, HEIGHT))
-    with pytest.raises(IgsrError, match=r"is 47x32 pixels but its camera .* is 48x32; resize"):
-        load_capture(tmp_path)
+    assert_refused(r"is 47x32 pixels but its camera .* is 48x32; resize", load_capture, tmp_path)
 
 
 def test_reduced_photos_with_other_names(tmp_path):
@@ -310,8 +299,7 @@ def test_reduced_photos_with_other_names(tmp_path):
     assert [int(view.image[0, 0, 0]) for view in views] == [60, 61, 62]
     (tmp_path / "images_4/image002.png").unlink()
     assert (load_capture(tmp_path, max_size=12).views[0].image == 2).all()  # of images_2
-    with pytest.raises(IgsrError, match=r"images_4/0\.png is missing"):
-        load_capture(tmp_path / "images_4")
+    assert_refused(r"images_4/0\.png is missing", load_capture, tmp_path / "images_4")
 
 
 def test_masks_of_reduced_photos(tmp_path):
@@ -326,5 +314,4 @@ def test_masks_of_reduced_photos(tmp_path):
     view = load_capture(tmp_path, max_size=24).views[0]
     assert view.mask is None or view.mask.all()
     save(tmp_path / "masks_2/0.png.png", np.full((4, 4), 255, dtype=np.uint8))
-    with pytest.raises(IgsrError, match=r"masks_2/0\.png\.png is 4x4 pixels"):
-        load_capture(tmp_path, max_size=24)
+    assert_refused(r"masks_2/0\.png\.png is 4x4 pixels", load_capture, tmp_path, max_size=24)

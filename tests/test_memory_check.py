@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from capture_files import photo, save, write_transforms
+from capture_files import assert_refused, photo, save, write_transforms
 
 from igsr.capture import load_capture, memory_check
 from igsr.capture.memory_check import USABLE_PART, PhotoSizes, available_memory
@@ -33,12 +33,13 @@ def test_the_message_names_a_size_that_fits(monkeypatch):
     TWELVE_MP.check_memory(size, 30_000)
     too_much = TWELVE_MP.needed_memory(size + memory_check.SIZE_STEP_PX, 30_000)
     assert too_much > USABLE_PART * 2e9
-    with pytest.raises(IgsrError, match=r"of 4000x3000 at --max-size 3000 would need"):
-        TWELVE_MP.check_memory(3000, 30_000)
-    with pytest.raises(IgsrError, match="of up to 4000x3000 would"):
-        replace(TWELVE_MP, sizes=[*TWELVE_MP.sizes, (10, 10)]).check_memory(splats=30_000)
-    with pytest.raises(IgsrError, match="give fewer photos, or free memory; no --max-size would"):
-        TWELVE_MP.check_memory(splats=10_000_000)
+    one_small = replace(TWELVE_MP, sizes=[*TWELVE_MP.sizes, (10, 10)])
+    for photos, given, words in (
+        (TWELVE_MP, (3000, 30_000), "of 4000x3000 at --max-size 3000 would need"),
+        (one_small, (None, 30_000), "of up to 4000x3000 would"),
+        (TWELVE_MP, (None, 10_000_000), "give fewer photos, or free memory; no --max-size would"),
+    ):
+        assert_refused(words, photos.check_memory, *given)
 
 
 def test_more_pixels_channels_masks_and_splats_need_more():
@@ -63,18 +64,14 @@ def test_depths_need_more():
 
 
 def test_photos_are_refused_before_any_is_decoded(tmp_path, monkeypatch):
-    def decode(*arguments):
-        raise AssertionError("a photo is decoded")
-
     write_transforms(tmp_path / "capture")
     for index in range(3):
         save(tmp_path / "photos" / f"{index}.png", photo(index, 400, 300))
     monkeypatch.setattr(memory_check, "available_memory", lambda: 9000)
-    monkeypatch.setattr("igsr.capture.image_files.load_pixels", decode)
-    with pytest.raises(IgsrError, match="3 photos of 48x32 would need"):
-        load_capture(tmp_path / "capture")
-    with pytest.raises(IgsrError, match="3 photos of 400x300 would need"):
-        read_photos(tmp_path / "photos")
+    decoder = "igsr.capture.image_files.load_pixels"
+    monkeypatch.setattr(decoder, lambda *_: pytest.fail("a photo is decoded"))
+    assert_refused("3 photos of 48x32 would need", load_capture, tmp_path / "capture")
+    assert_refused("3 photos of 400x300 would need", read_photos, tmp_path / "photos")
 
 
 def test_available_memory():
@@ -94,10 +91,8 @@ def test_available_memory():
 def test_limits_of_control_groups(tmp_path, monkeypatch, version):
     root = tmp_path / "cgroup"
     memory = root / "memory" if version == 1 else root
-    limit, used = {
-        1: ("memory.limit_in_bytes", "memory.usage_in_bytes"),
-        2: ("memory.max", "memory.current"),
-    }[version]
+    old, new = ("limit_in_bytes", "usage_in_bytes"), ("max", "current")
+    limit, used = (f"memory.{name}" for name in (old if version == 1 else new))
     group = memory / "jobs" / "mine"
     group.mkdir(parents=True)
     own = tmp_path / "own"

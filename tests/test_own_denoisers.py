@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import sys
-import textwrap
 from pathlib import Path
 
 import numpy as np
 import pytest
 import scenes
 import torch
+from capture_files import assert_refused
 from PIL import Image
 from refinements import refine, truthful
 
@@ -51,26 +51,25 @@ def test_a_refinement_uses_the_confidence_of_the_denoiser(few_photos):
         assert candidate.mean_confidence == pytest.approx(weight)
 
 
+MODULE = """
+import numpy as np
+
+def make():
+    return lambda render, photos: np.clip(1.0 - render.color, 0.0, 1.0)
+
+def fails():
+    raise RuntimeError("no weights here")
+
+def nothing():
+    return None
+
+number = 3
+"""
+
+
 @pytest.fixture
 def module(tmp_path, monkeypatch):
-    (tmp_path / "my_denoiser.py").write_text(
-        textwrap.dedent(
-            """
-            import numpy as np
-
-            def make():
-                return lambda render, photos: np.clip(1.0 - render.color, 0.0, 1.0)
-
-            def fails():
-                raise RuntimeError("no weights here")
-
-            def nothing():
-                return None
-
-            number = 3
-            """
-        )
-    )
+    (tmp_path / "my_denoiser.py").write_text(MODULE)
     (tmp_path / "broken.py").write_text("import not_there_at_all\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.chdir(tmp_path)
@@ -86,12 +85,11 @@ def test_a_factory_is_found_by_module_or_file(module, module_name):
     assert picture == pytest.approx(0.75)
 
 
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("my_denoiser", "must be MODULE:FACTORY"),
-        (":make", "must be MODULE:FACTORY"),
-        ("my_denoiser:", "must be MODULE:FACTORY"),
+@pytest.mark.usefixtures("module")
+def test_bad_names_are_errors():
+    for name in ("my_denoiser", ":make", "my_denoiser:"):
+        assert_refused("must be MODULE:FACTORY", named_denoiser, name)
+    for name, message in (
         ("not_there:make", "not_there cannot be imported: ModuleNotFoundError"),
         ("not_there.py:make", "there is no file not_there.py"),
         ("broken:make", "broken cannot be imported: .*not_there_at_all"),
@@ -100,11 +98,8 @@ def test_a_factory_is_found_by_module_or_file(module, module_name):
         ("my_denoiser:number", "my_denoiser has no function number"),
         ("my_denoiser:fails", "my_denoiser:fails failed: RuntimeError: no weights here"),
         ("my_denoiser:nothing", "must return a function of a render and photos, not NoneType"),
-    ],
-)
-def test_bad_names_are_errors(module, name, message):
-    with pytest.raises(igsr.IgsrError, match=message):
-        named_denoiser(name)
+    ):
+        assert_refused(message, named_denoiser, name)
 
 
 @pytest.fixture
@@ -126,32 +121,23 @@ def test_the_command_denoise_takes_a_name(module, scene, igsr_here):
 
 
 def test_the_command_refine_takes_a_name(module, scene, igsr_here):
-    done = igsr_here(
-        *("refine", "ball", "--out", "out", "--steps", 30, "--rounds", 1, "--backend", "cpu"),
-        *("--denoiser", "my_denoiser:make"),
-    )
+    options = ("--out", "out", "--steps", 30, "--rounds", 1, "--backend", "cpu")
+    done = igsr_here("refine", "ball", *options, "--denoiser", "my_denoiser:make")
     assert done.returncode == 0, done.stderr
     report = json.loads((scene / "out/report.json").read_text())
     # A negative of the scene improves nothing.
     assert not any(done.get("accepted", False) for done in report["rounds"])
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        ("denoise", "ball.ply", "--capture", "ball", "--out", "out"),
-        ("refine", "ball", "--out", "out", "--steps", 5),
-    ],
-)
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [("my_denoiser:fails", "no weights here"), ("missing.safetensors", "missing.safetensors")],
-)
-def test_the_commands_report_a_bad_denoiser(module, scene, command, name, message, igsr_here):
-    done = igsr_here(*command, "--denoiser", name, "--backend", "cpu")
-    assert done.returncode == 1
-    assert message in done.stderr
-    assert not (scene / "out").exists()
+@pytest.mark.parametrize("command", ["denoise ball.ply --capture ball", "refine ball --steps 5"])
+def test_the_commands_report_a_bad_denoiser(module, scene, command, igsr_here):
+    bad = {"my_denoiser:fails": "no weights here", "missing.safetensors": "missing.safetensors"}
+    for name, message in bad.items():
+        options = ("--out", "out", "--denoiser", name, "--backend", "cpu")
+        done = igsr_here(*command.split(), *options)
+        assert done.returncode == 1
+        assert message in done.stderr
+        assert not (scene / "out").exists()
 
 
 def source(offset, color):
@@ -197,13 +183,11 @@ def test_large_renders_are_denoised_small_and_keep_their_detail():
 
 
 def test_bad_models_and_sizes_are_errors():
-    with pytest.raises(igsr.IgsrError, match=r"returned \[1, 3, 8, 8\] for \[1, 3, 16, 16\]"):
-        SingleStepDenoiser(lambda render, photo: render[..., ::2, ::2])(
-            Buffers(np.zeros((16, 16, 3), np.float32)), []
-        )
+    half = SingleStepDenoiser(lambda render, photo: render[..., ::2, ::2])
+    buffers = Buffers(np.zeros((16, 16, 3), np.float32))
+    assert_refused(r"returned \[1, 3, 8, 8\] for \[1, 3, 16, 16\]", half, buffers, [])
     for bad in ({"multiple": 0}, {"longest": 4}):
-        with pytest.raises(igsr.IgsrError, match="multiple must be at least 1"):
-            SingleStepDenoiser(lambda render, photo: render, **bad)
+        assert_refused("multiple must be at least 1", SingleStepDenoiser, half, **bad)
 
 
 PIPELINE = """
@@ -239,6 +223,7 @@ class DifixPipeline:
 
 def test_the_example_adapts_difix(tmp_path, monkeypatch):
     """A made-up pipeline with its interface goes half-way to the photo."""
+    assert_refused("No module named 'pipeline_difix'", named_denoiser, f"{EXAMPLE}:make")
     (tmp_path / "pipeline_difix.py").write_text(PIPELINE)
     torch.save(torch.tensor(0.5), tmp_path / "gain.pt")
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -252,8 +237,3 @@ def test_the_example_adapts_difix(tmp_path, monkeypatch):
         sys.modules.pop("difix_denoiser", None)
     assert picture == pytest.approx(0.7, abs=1e-6)
     assert confidence.max() < 0.25
-
-
-def test_without_difix_the_example_names_the_missing_module():
-    with pytest.raises(igsr.IgsrError, match="No module named 'pipeline_difix'"):
-        named_denoiser(f"{EXAMPLE}:make")

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import scenes
 import textured_room as room
+from capture_files import assert_refused
 from PIL import Image, ImageDraw, ImageFilter
 
 import igsr
@@ -18,7 +19,6 @@ from igsr.capture.photo_checks import check_photos, is_screenshot, split_unfit
 from igsr.capture.photo_folder import Photo, read_photos
 from igsr.capture.sharpness import blur, blurred_photos
 from igsr.capture.types import intrinsic_matrix
-from igsr.errors import IgsrError
 
 SIZE = (240, 180)
 K = intrinsic_matrix(200.0, 200.0, 120.0, 90.0)
@@ -113,11 +113,10 @@ def test_other_pictures_are_no_screenshots(photos):
 def test_a_folder_of_screenshots_is_an_error(tmp_path, photos):
     for index in range(4):
         Image.fromarray(screenshot("", index).image).save(tmp_path / f"{index}.png")
-    with pytest.raises(IgsrError, match=r"0 is left .*0\.png, 1\.png, 2\.png and 1 more: .*screen"):
-        igsr.find_cameras(tmp_path)
+    words = r"0 is left .*0\.png, 1\.png, 2\.png and 1 more: .*screen"
+    assert_refused(words, igsr.find_cameras, tmp_path)
     Image.fromarray(photos[0].image).save(tmp_path / "photo.png")
-    with pytest.raises(IgsrError, match=r"at least 2 photos, and 1 is left"):
-        igsr.find_cameras(tmp_path)
+    assert_refused("at least 2 photos, and 1 is left", igsr.find_cameras, tmp_path)
 
 
 def test_exif_of_a_screenshot(tmp_path, photos):
@@ -186,24 +185,17 @@ def turned_away(view, index):
     return replace(view, camera=Camera(viewmat, view.camera.K, 24, 24), name=f"{index}.png")
 
 
-def zoomed(view):
-    K = view.camera.K * [[1.5], [1.5], [1.0]]
-    return replace(view, camera=replace(view.camera, K=K), name="zoomed.png")
-
-
-def with_image(view, image):
-    return replace(view, image=image)
-
-
 def test_good_photos_are_not_reported(views):
     apart = [turned_away(views[k], k) for k in range(3)]
+    K = views[2].camera.K * [[1.5], [1.5], [1.0]]
+    zoomed = replace(views[2], camera=replace(views[2].camera, K=K), name="zoomed.png")
     outline = np.zeros((24, 24, 4), np.uint8)  # of a black object
     outline[8:, :, 3] = 255
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for good in (views, views[:2], [*views, zoomed(views[2])], [*apart, *views]):
+        for good in (views, views[:2], [*views, zoomed], [*apart, *views]):
             check_photos(good)
-        check_photos([with_image(view, outline) for view in views])
+        check_photos([replace(view, image=outline) for view in views])
 
 
 def test_a_fit_of_one_photo_works(views):
@@ -212,42 +204,26 @@ def test_a_fit_of_one_photo_works(views):
     assert np.isfinite(splats.means).all()
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (
-            lambda views: [replace(view, camera=views[0].camera) for view in views],
-            "All cameras are at one place",
-        ),
-        (
-            lambda views: [*views, replace(views[2], name="again.png")],
-            r"02\.png, again\.png have the same camera",
-        ),
-        (
-            lambda views: [turned_away(views[k], k) for k in range(3)],
-            "No two photos see anything in common",
-        ),
-        (
-            lambda views: [with_image(views[0], np.zeros((24, 24, 3), np.uint8)), *views[1:]],
-            "black or fully transparent; leave",
-        ),
-    ],
-)
-def test_unsuitable_photos_are_reported(views, change, words):
-    with pytest.warns(UserWarning, match=words):
-        check_photos(change(views))
+def test_unsuitable_photos_are_reported(views):
+    at_one_place = [replace(view, camera=views[0].camera) for view in views]
+    apart = [turned_away(views[k], k) for k in range(3)]
+    black = replace(views[0], image=np.zeros((24, 24, 3), np.uint8))
+    for photos, words in (
+        (at_one_place, "All cameras are at one place"),
+        ([*views, replace(views[2], name="a.png")], r"02\.png, a\.png have the same camera"),
+        (apart, "No two photos see anything in common"),
+        ([black, *views[1:]], "black or fully transparent; leave"),
+    ):
+        with pytest.warns(UserWarning, match=words):
+            check_photos(photos)
 
 
-@pytest.mark.parametrize("alpha", [None, 0, 255])
-def test_empty_photos_are_refused(views, alpha):
-    image = np.zeros((24, 24, 3 if alpha is None else 4), np.uint8)
-    if alpha is not None:
-        image[..., :3], image[..., 3] = 255 - alpha, alpha
-    with pytest.raises(IgsrError, match="Every photo is black or fully transparent"):
-        check_photos([with_image(view, image) for view in views])
-
-
-def test_a_mask_that_hides_everything(views):
+def test_empty_photos_are_refused(views):
+    black, transparent = np.zeros((24, 24, 3), np.uint8), np.zeros((24, 24, 4), np.uint8)
+    transparent[..., :3] = 255
+    opaque = np.dstack([black, np.full((24, 24), 255, np.uint8)])
+    for image in (black, transparent, opaque):
+        photos = [replace(view, image=image) for view in views]
+        assert_refused("Every photo is black or fully transparent", check_photos, photos)
     hidden = replace(views[1], mask=np.zeros((24, 24), bool))
-    with pytest.raises(IgsrError, match=r"01\.png: its mask leaves no pixel"):
-        check_photos([hidden, *views])
+    assert_refused(r"01\.png: its mask leaves no pixel", check_photos, [hidden, *views])

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scenes
+from capture_files import assert_refused, save
 from made_up_tracks import projected, tracked
-from PIL import Image
 
 import igsr
 from igsr.capture import Points
@@ -89,9 +89,8 @@ def test_better_qualities_have_larger_photos_and_more_steps_and_splats():
     for values in (sizes, [s.steps for s in settings], [s.max_splats for s in settings]):
         assert values == sorted(set(values))
     assert presets.default_max_size("gpu") > presets.default_max_size("cpu") == sizes[1]
-    for choose in (settings_for, presets.default_max_size):
-        with pytest.raises(igsr.IgsrError, match="quality must be one of draft, normal, high"):
-            choose(8 if choose is settings_for else "cpu", "best")
+    for choose, first in ((settings_for, 8), (presets.default_max_size, "cpu")):
+        assert_refused("quality must be one of draft, normal, high", choose, first, "best")
 
 
 def test_short_fits_have_larger_learning_rates():
@@ -120,11 +119,7 @@ def test_a_fit_uses_the_settings_for_its_photos(capture, tmp_path):
 
 def test_overlap_counts_photos_from_similar_directions():
     ring = scenes.capture(views=12, size=40, alpha=True).views
-    all_round, half, one = (
-        photo_statistics(ring),
-        photo_statistics(ring[::2]),
-        photo_statistics(ring[:1]),
-    )
+    all_round, half, one = map(photo_statistics, (ring, ring[::2], ring[:1]))
     assert (all_round.photos, all_round.pixels, all_round.visible_fraction) == (12, 1600.0, 1.0)
     # Within 60 degrees of each, itself included, on a ring with steps of 30 degrees.
     assert 3.0 <= all_round.overlap <= 5.0
@@ -172,10 +167,7 @@ def test_detail_is_the_mean_of_a_few_photos_or_files(tmp_path):
     views = scenes.capture(views=20, size=48, alpha=True).views
     counts = [count_squares(view.image) for view in views]
     assert photo_statistics(views).detail == pytest.approx(np.mean(counts[::2]))
-    files = []
-    for view in views:
-        files.append(tmp_path / f"{len(files)}.png")
-        Image.fromarray(view.image).save(files[-1])
+    files = [save(tmp_path / f"{k}.png", view.image) for k, view in enumerate(views)]
     assert detail_of_files(files, None) == pytest.approx(np.mean(counts[::5]))
     assert 0.0 < detail_of_files(files, 24) < detail_of_files(files, None)
     files[5].write_text("no photo")
@@ -189,9 +181,8 @@ def count_outside_hull(splats, capture):
     for view in capture.train_views:
         size = view.image.shape[0]
         alpha = np.pad(view.image[..., 3], 2, mode="edge") > 0
-        near = np.any(
-            [alpha[y : y + size, x : x + size] for y in range(5) for x in range(5)], axis=0
-        )
+        windows = [alpha[y : y + size, x : x + size] for y in range(5) for x in range(5)]
+        near = np.any(windows, axis=0)
         pixel = np.floor(projected(view.camera, splats.means + splats.origin)).astype(int)
         seen = ((pixel >= 0) & (pixel < size)).all(axis=1)
         column, row = np.clip(pixel, 0, size - 1).T
@@ -203,10 +194,8 @@ def test_start_depends_on_the_photos(capture):
     assert chosen_start(capture) == "hull"
     assert chosen_start(scenes.capture(views=4, size=24)) == "sift"
     assert chosen_start(scenes.capture(views=16, size=8)) == "depths"
-    with pytest.raises(
-        igsr.IgsrError, match=r"^made-up has photos without alpha; start hull needs"
-    ):
-        initial_splats(scenes.capture(views=4, size=24), 0, 300, 1, "hull")
+    words = "^made-up has photos without alpha; start hull needs"
+    assert_refused(words, initial_splats, scenes.capture(views=4, size=24), 0, 300, 1, "hull")
 
 
 @pytest.mark.parametrize("start", ["hull", "rays", "random"])
@@ -217,11 +206,10 @@ def test_starts_make_splats(capture, start):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_hull_splats_are_inside_the_hull(capture, seed):
-    hull, random = (
-        initial_splats(capture, seed, 1000, 0, start)[0] for start in ("hull", "random")
-    )
-    assert count_outside_hull(hull, capture) == 0
-    assert count_outside_hull(random, capture) > 150
+    starts = (initial_splats(capture, seed, 1000, 0, start)[0] for start in ("hull", "random"))
+    in_hull, at_random = (count_outside_hull(splats, capture) for splats in starts)
+    assert in_hull == 0
+    assert at_random > 150
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
@@ -283,8 +271,7 @@ def test_held_out_photos_do_not_contribute_points():
     seen = points.seen_by([view.name for view in views[:5]])
     assert np.array_equal(seen.xyz, xyz[counts >= 2])
     assert np.array_equal(seen.confidence, points.confidence[counts >= 2])
-    split = [replace(view, split="train") for view in views[:5]]
-    split.append(replace(views[5], split="test"))
+    split = [replace(view, split="train" if view is not views[5] else "test") for view in views]
     splats, start = initial_splats(igsr.Capture(Path("a"), split, points), 0, 10_000, 0)
     assert (start, len(splats)) == ("points", (counts >= 2).sum())
     empty = Points(xyz, points.rgb, tracks=Tracks([], *(tracks.view[:0],) * 2, tracks.xy[:0]))

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from capture_files import assert_refused
 from made_up_tracks import projected, tracked
 from refinements import contented, lying, refine, same, truthful, unsure
 
@@ -22,13 +23,8 @@ from igsr.refinement.selection import MIN_CONFIDENCE, select_views
 
 SEEDS = range(5)
 #: Stages of a refinement's events.
-STAGES = {
-    "fit photos",
-    "cross-validate",
-    "denoise novel views",
-    "refit with novel views",
-    "score test views",
-}
+STAGES = {"fit photos", "cross-validate", "denoise novel views"}
+STAGES |= {"refit with novel views", "score test views"}
 
 
 @pytest.fixture(scope="module")
@@ -40,10 +36,7 @@ def by_truth(few_photos):
 def test_a_round_is_accepted_if_and_only_if_the_combined_error_falls(by_truth, few_photos):
     by_lies = [refine(few_photos, 1, lying, seed=seed, steps=100) for seed in SEEDS]
     for done in (done for refined in (*by_truth, *by_lies) for done in refined.rounds):
-        before, after = (
-            combined_error(done.validation_before),
-            combined_error(done.validation_after),
-        )
+        before, after = map(combined_error, (done.validation_before, done.validation_after))
         assert done.accepted == (after < before)
         assert (done.splats is not None) == (done.test is not None) == done.accepted
         assert bool(done.selected) == done.accepted
@@ -110,6 +103,18 @@ def test_views_of_one_panorama_are_held_out_together_and_count_as_one_photo(ball
         assert refined.stop == Stop(StopReason.TOO_FEW_PHOTOS, 3)
 
 
+def watch(monkeypatch, name, listener):
+    """Tell the listener the result and the arguments of each call of a function of ``rounds``."""
+    function = getattr(rounds, name)
+
+    def watched(*given, **options):
+        result = function(*given, **options)
+        listener(result, *given, **options)
+        return result
+
+    monkeypatch.setattr(rounds, name, watched)
+
+
 def test_folds_are_fitted_with_the_settings_for_all_photos(ball_photos, monkeypatch):
     photos = ball_photos.train_views
     measured = photo_statistics(photos)
@@ -119,13 +124,11 @@ def test_folds_are_fitted_with_the_settings_for_all_photos(ball_photos, monkeypa
     dropout = settings_for(measured).dropout
     assert settings_for(photo_statistics(photos[::2])).dropout != dropout
     fits = []
-    fit_capture = rounds.fit_capture
 
-    def watched(capture, **given):
+    def seen(_, capture, **given):
         fits.append((len(capture.views), given["density"], given["sh_degree"], given["dropout"]))
-        return fit_capture(capture, **given)
 
-    monkeypatch.setattr(rounds, "fit_capture", watched)
+    watch(monkeypatch, "fit_capture", seen)
     refine(ball_photos, 1, lying, steps=40)
     assert [count for count, *_ in fits][:4] == [9, 7, 8, 8]
     assert {tuple(settings) for _, *settings in fits} == {("original", 2, dropout)}
@@ -136,9 +139,8 @@ def test_tracks_are_in_pixels_of_the_halved_photos(ball_photos, monkeypatch):
     xyz = np.random.default_rng(0).uniform(-0.4, 0.4, (30, 3))
     photos = replace(ball_photos, points=tracked(ball_photos.views, xyz))
     sizes = set()
-    fit_capture = rounds.fit_capture
 
-    def watched(capture, **given):
+    def seen(_, capture, **given):
         tracks = capture.points.tracks
         for view in capture.views:
             if view.name in tracks.names:
@@ -146,9 +148,8 @@ def test_tracks_are_in_pixels_of_the_halved_photos(ball_photos, monkeypatch):
                 at = projected(view.camera, xyz[tracks.point[shown]])
                 assert np.abs(tracks.xy[shown] - at).max() < 1e-9
                 sizes.add(view.camera.width)
-        return fit_capture(capture, **given)
 
-    monkeypatch.setattr(rounds, "fit_capture", watched)
+    watch(monkeypatch, "fit_capture", seen)
     refine(photos, 1, lying, steps=10)
     assert sizes == {40, 10}
 
@@ -179,30 +180,35 @@ def test_pixels_behind_masks_get_no_weight(ball_photos):
     assert 0.1 < (some > 0.5).mean() < 0.9
 
 
+@pytest.fixture
+def earlier(tmp_path):
+    """A checkpoint of an earlier run in the same folder."""
+    path = tmp_path / "checkpoints/whole.npz"
+    path.parent.mkdir()
+    path.write_bytes(b"of an earlier run")
+    return path
+
+
 @pytest.mark.parametrize(
-    ("max_rounds", "options", "message"),
+    ("options", "message"),
     [
-        ("many", {}, 'rounds must be a whole number or "auto"'),
-        (-1, {}, "rounds must not be negative"),
-        (True, {}, "rounds must be a whole number"),
-        (1, {"resume": True}, "resume needs out"),
-        (1, {"backend": "reference"}, "backend must be one of auto, cpu, gpu, not 'reference'"),
-        (1, {"steps": 0}, "steps must be from 1 to 10000000, not 0"),
-        (1, {"steps": 20_000_000}, "steps must be from 1 to 10000000, not 20000000"),
-        (1, {"steps": 2.9}, "steps must be a whole number, not 2.9"),
-        (1, {"steps": "many"}, "steps must be"),
-        (1, {"seed": -1}, "seed must be from 0 to"),
+        ({"rounds": "many"}, 'rounds must be a whole number or "auto"'),
+        ({"rounds": -1}, "rounds must not be negative"),
+        ({"rounds": True}, "rounds must be a whole number"),
+        ({"resume": True, "out": None}, "resume needs out"),
+        ({"backend": "reference"}, "backend must be one of auto, cpu, gpu, not 'reference'"),
+        ({"steps": 0}, "steps must be from 1 to 10000000, not 0"),
+        ({"steps": 20_000_000}, "steps must be from 1 to 10000000, not 20000000"),
+        ({"steps": 2.9}, "steps must be a whole number, not 2.9"),
+        ({"steps": "many"}, "steps must be"),
+        ({"seed": -1}, "seed must be from 0 to"),
     ],
 )
-def test_bad_arguments(few_photos, max_rounds, options, message, monkeypatch, tmp_path):
-    earlier = tmp_path / "checkpoints/whole.npz"
-    earlier.parent.mkdir()
-    earlier.write_bytes(b"of an earlier run")
-    given = options if "resume" in options else {**options, "out": tmp_path}
+def test_bad_arguments(few_photos, options, message, monkeypatch, earlier):
+    given = {"rounds": 1, "denoiser": truthful, "out": earlier.parents[1], **options}
     monkeypatch.setattr(find, "estimated_cameras", lambda *_: pytest.fail("cameras were sought"))
     for photos in (few_photos, "a folder"):
-        with pytest.raises(igsr.IgsrError, match=message):
-            refine(photos, max_rounds, truthful, **given)
+        assert_refused(message, refine, photos, **given)
     assert earlier.is_file()
 
 
@@ -210,16 +216,13 @@ def test_bad_arguments(few_photos, max_rounds, options, message, monkeypatch, tm
     ("split", "message"), [("train", "no pixel to fit"), ("test", "no pixel to score")]
 )
 def test_unusable_photos_end_it_before_files_are_removed(
-    few_photos, split, message, monkeypatch, tmp_path
+    few_photos, split, message, monkeypatch, earlier
 ):
     monkeypatch.setattr(rounds, "fit_capture", lambda *_, **__: pytest.fail("it was fitted"))
-    earlier = tmp_path / "checkpoints/whole.npz"
-    earlier.parent.mkdir()
-    earlier.write_bytes(b"of an earlier run")
     nothing = np.zeros((40, 40), np.bool_)
     views = [replace(v, mask=nothing) if v.split == split else v for v in few_photos.views]
-    with pytest.raises(igsr.IgsrError, match=message):
-        refine(igsr.Capture(few_photos.path, views), 1, truthful, out=tmp_path)
+    photos = igsr.Capture(few_photos.path, views)
+    assert_refused(message, refine, photos, 1, truthful, out=earlier.parents[1])
     assert earlier.is_file()
 
 
@@ -227,13 +230,11 @@ def test_unusable_photos_end_it_before_files_are_removed(
 def test_no_photo_is_held_out_by_two_folds(ball_photos, count, monkeypatch):
     names = {view.name for view in ball_photos.train_views[:count]}
     held_out = []
-    fit_photos = rounds.fit_photos
 
-    def watched(context, fold, photos, *rest):
+    def seen(_, context, fold, photos, *rest):
         held_out.append(names - {photo.name for photo in photos})
-        return fit_photos(context, fold, photos, *rest)
 
-    monkeypatch.setattr(rounds, "fit_photos", watched)
+    watch(monkeypatch, "fit_photos", seen)
     fewer = igsr.Capture(ball_photos.path, ball_photos.train_views[:count])
     (done,) = refine(fewer, 1, lying, steps=40).rounds
     assert len(held_out) == 3
@@ -246,14 +247,7 @@ def test_no_photo_is_held_out_by_two_folds(ball_photos, count, monkeypatch):
 def test_folds_of_smaller_photos_have_as_many_splats_per_pixel(ball_photos, monkeypatch):
     monkeypatch.setattr(cross_validation, "MIN_FOLD_SIDE_PX", 16)
     counts = []
-    fit_photos = rounds.fit_photos
-
-    def watched(*given):
-        fitted = fit_photos(*given)
-        counts.append(len(fitted.splats))
-        return fitted
-
-    monkeypatch.setattr(rounds, "fit_photos", watched)
+    watch(monkeypatch, "fit_photos", lambda fitted, *_: counts.append(len(fitted.splats)))
     refined = refine(ball_photos, 1, lying, steps=400)
     assert len(counts) == 3
     assert 250 < len(refined.first) <= 1000
@@ -274,12 +268,11 @@ def test_folds_fit_photos_that_are_halved_at_most_twice(side, small, steps):
 
 
 def test_three_scores_together_decide_about_a_round():
-    def error(psnr, ssim, flip):
-        return combined_error({"psnr": psnr, "ssim": ssim, "flip": flip})
+    def error(*scores):
+        return combined_error(dict(zip(("psnr", "ssim", "flip"), scores, strict=True)))
 
     assert error(20.0, 0.9, 0.1) == pytest.approx(0.1)
     before = error(26.755, 0.9279, 0.0780)
     assert error(26.850, 0.9297, 0.0782) < before, "a little more FLIP does not outweigh the rest"
-    assert error(26.750, 0.9279, 0.0780) > before
-    assert error(26.755, 0.9278, 0.0780) > before
-    assert error(26.755, 0.9279, 0.0781) > before
+    for worse in ((26.750, 0.9279, 0.0780), (26.755, 0.9278, 0.0780), (26.755, 0.9279, 0.0781)):
+        assert error(*worse) > before

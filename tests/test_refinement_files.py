@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
 import scenes
+from capture_files import assert_refused
 from PIL import Image
 from refinements import refine, same, truthful, unsure
 
@@ -90,18 +92,16 @@ def test_the_sheet_shows_test_views_before_and_after_the_rounds(helped):
             assert np.abs(picture - shown).max() <= 1.0
 
 
-@pytest.mark.parametrize(
-    ("number", "stage"),
-    [
-        (0, "fit photos"),
-        pytest.param(1, "fit photos", marks=pytest.mark.long),
-        pytest.param(1, "denoise novel views", marks=pytest.mark.long),
-        pytest.param(1, "cross-validate", marks=pytest.mark.long),
-        (1, "refit with novel views"),
-        pytest.param(2, "denoise novel views", marks=pytest.mark.long),
-        (2, "refit with novel views"),
-    ],
-)
+def long(*values):
+    return pytest.param(*values, marks=pytest.mark.long)
+
+
+MOMENTS = [(0, "fit photos"), (1, "refit with novel views"), (2, "refit with novel views")]
+MOMENTS += [long(1, stage) for stage in ("fit photos", "denoise novel views", "cross-validate")]
+MOMENTS += [long(2, "denoise novel views")]
+
+
+@pytest.mark.parametrize(("number", "stage"), MOMENTS)
 def test_stopped_at_any_moment_and_resumed_it_ends_the_same(
     few_photos, helped, tmp_path, number, stage
 ):
@@ -113,10 +113,7 @@ def test_stopped_at_any_moment_and_resumed_it_ends_the_same(
         assert done.validation_after == expected.validation_after
 
 
-@pytest.mark.parametrize(
-    "renames",
-    [pytest.param(2, marks=pytest.mark.long), 12, pytest.param(40, marks=pytest.mark.long)],
-)
+@pytest.mark.parametrize("renames", [long(2), 12, long(40)])
 def test_killed_between_two_files_and_resumed_it_ends_the_same(
     few_photos, helped, tmp_path, renames, monkeypatch
 ):
@@ -149,19 +146,16 @@ def test_earlier_results_stay_until_a_resumed_run_has_more(few_photos, helped, t
         picture, confidence = truthful(buffers, photos)
         return 0.99 * picture, confidence
 
-    with pytest.raises(igsr.IgsrError, match="was made from other photos"):
-        refine(few_photos, 2, other, out=out, resume=True)
+    words = "was made from other photos"
+    assert_refused(words, refine, few_photos, 2, other, out=out, resume=True)
     stop = stop_in("score test views", 2)
     with pytest.raises(scenes.Stop):
         refine(few_photos, 2, truthful, out=out, resume=True, progress=stop)
     assert files_in(out) == before
     refine(few_photos, 2, truthful, out=out, resume=True)
     after = files_in(out)
-    seconds = [
-        json.loads(files[(out / "report.json").relative_to(out)])["parts"]["fit"]["seconds"]
-        for files in (before, after)
-    ]
-    assert seconds[1] >= seconds[0] > 0.0, "the time of the first run counts"
+    first, both = (json.loads(files[Path("report.json")])["parts"] for files in (before, after))
+    assert both["fit"]["seconds"] >= first["fit"]["seconds"] > 0.0, "the first run's time counts"
     for path in before:
         if path.name == "scene.ply" or path.name.startswith("view-"):
             assert after[path] == before[path]
@@ -183,9 +177,8 @@ def test_a_new_run_uses_nothing_of_an_earlier_one(few_photos, tmp_path):
 
 @pytest.mark.parametrize("held_out", [True, False])
 def test_without_a_round_the_pictures_show_the_fit(few_photos, held_out, tmp_path):
-    photos = few_photos
-    if not held_out:
-        photos = igsr.Capture(photos.path, photos.train_views)
+    views = few_photos.views if held_out else few_photos.train_views
+    photos = igsr.Capture(few_photos.path, views)
     refined = refine(photos, 1, unsure, out=tmp_path, steps=20, cross_validate=False)
     assert not refined.rounds
     report = json.loads((tmp_path / "report.json").read_text())
@@ -197,12 +190,6 @@ def test_without_a_round_the_pictures_show_the_fit(few_photos, held_out, tmp_pat
     assert np.asarray(Image.open(tmp_path / "views.png")).shape[0] > 40 * len(shown)
 
 
-def test_out_must_be_a_folder(few_photos, tmp_path):
-    (tmp_path / "out").write_text("a file")
-    with pytest.raises(igsr.IgsrError, match="out"):
-        refine(few_photos, 0, truthful, out=tmp_path / "out")
-
-
 def test_after_a_full_disk_a_run_resumes(few_photos, helped, tmp_path, monkeypatch):
     save = Image.Image.save
 
@@ -212,8 +199,8 @@ def test_after_a_full_disk_a_run_resumes(few_photos, helped, tmp_path, monkeypat
         save(image, file, **options)
 
     monkeypatch.setattr(Image.Image, "save", full)
-    with pytest.raises(igsr.IgsrError, match=r"Cannot write .*png: No space left on device"):
-        refine(few_photos, 2, truthful, out=tmp_path)
+    words = r"Cannot write .*png: No space left on device"
+    assert_refused(words, refine, few_photos, 2, truthful, out=tmp_path)
     assert same(igsr.Splats.load(tmp_path / "rounds/0/scene.ply"), helped[0].first)
     monkeypatch.setattr(Image.Image, "save", save)
     refined = refine(few_photos, 2, truthful, out=tmp_path, resume=True)
@@ -224,10 +211,8 @@ def test_impossible_times_in_a_report_are_ignored(tmp_path):
     part = '{"parts": {"fit": {"seconds": %s, "cpu_seconds": 1, "peak_memory_bytes": null}}}'
     (tmp_path / "report.json").write_text(part % 2.5)
     assert parts_so_far(tmp_path)["fit"].seconds == 2.5
-    for text in (
-        *(part % value for value in ('"long"', -50, "NaN", "1e999", f"1{'0' * 400}")),
-        "[" * 100_000,
-    ):
+    impossible = '"long"', -50, "NaN", "1e999", f"1{'0' * 400}"
+    for text in (*(part % value for value in impossible), "[" * 100_000):
         (tmp_path / "report.json").write_text(text)
         assert parts_so_far(tmp_path) == {}
 
@@ -305,7 +290,9 @@ def test_a_run_publishes_its_progress_and_photos(few_photos, tmp_path, monkeypat
     assert json.loads((view / "run.json").read_text()) == {"background": [1.0, 1.0, 1.0]}
 
 
-def test_a_run_goes_on_if_its_progress_cannot_be_written(few_photos, tmp_path):
+def test_out_must_be_a_folder_but_progress_need_not_be_written(few_photos, tmp_path):
+    (tmp_path / "out").write_text("a file")
+    assert_refused("out", refine, few_photos, 0, truthful, out=tmp_path / "out")
     (tmp_path / "view").write_text("a file of one's own")
     refined = refine(few_photos, 1, truthful, out=tmp_path, steps=40, cross_validate=False)
     assert len(refined.rounds) == 1

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
+from capture_files import assert_refused
 from refinements import BALL, STEPS, WHITE, same
 
 import igsr
@@ -21,10 +22,7 @@ ONES = np.ones((40, 40), np.float32)
 
 def pseudo(view, weights=ONES, **fields):
     """A photo as a pseudo-view, with other fields."""
-    view = replace(view, **fields)
-    return igsr.PseudoView(
-        view.name, view.camera, view.split, view.image, view.mask, weights=weights
-    )
+    return scenes.pseudo_view(view, weights=weights, **fields)
 
 
 def test_weights_of_one_are_as_none_and_weights_of_zero_as_a_mask(ball_photos):
@@ -41,10 +39,8 @@ def test_weights_of_one_are_as_none_and_weights_of_zero_as_a_mask(ball_photos):
     assert same(whole, fitted([pseudo(view) for view in photos]))
     assert same(half, fitted([replace(view, mask=left > 0) for view in photos]))
     assert not same(whole, half)
-    with pytest.raises(igsr.IgsrError, match="weights must be finite and not negative"):
-        pseudo(photos[0], -left)
-    with pytest.raises(igsr.IgsrError, match="weights"):
-        pseudo(photos[0], left[1:])
+    assert_refused("weights must be finite and not negative", pseudo, photos[0], -left)
+    assert_refused("weights", pseudo, photos[0], left[1:])
 
 
 @pytest.mark.filterwarnings("ignore:.*have the same camera", "ignore:.*black or fully")
@@ -77,16 +73,14 @@ def test_a_fit_continues_from_splats(ball_photos):
         (first, {"max_splats": 2}, "give at least one and at most max_splats"),
         (antialiased, {}, "antialiased"),
     ):
-        with pytest.raises(igsr.IgsrError, match=message):
-            scenes.fit(ball_photos, 5, start=start, backend="cpu", **settings)
+        assert_refused(message, scenes.fit, ball_photos, 5, start=start, backend="cpu", **settings)
 
 
 @pytest.mark.filterwarnings("ignore:.*have the same camera")
 def test_novel_views_change_neither_settings_nor_initialization(ball_photos):
-    photos = ball_photos.train_views[:3]
-    views = [
-        pseudo(view, name=f"{k}-{view.name}") for k in range(3) for view in ball_photos.train_views
-    ]
+    train = ball_photos.train_views
+    photos = train[:3]
+    views = [pseudo(view, name=f"{k}-{view.name}") for k in range(3) for view in train]
 
     def begun(views):
         capture = igsr.Capture(ball_photos.path, views)
@@ -99,17 +93,11 @@ def test_novel_views_change_neither_settings_nor_initialization(ball_photos):
 
 def test_a_round_fits_photos_and_novel_views_from_the_initialization(helped):
     capture, done = helped[0].capture, helped[0].rounds[0]
-    views = [
-        igsr.PseudoView(
-            f"whole-round1-{k}.png",
-            candidate.view.camera,
-            "train",
-            candidate.denoised,
-            weights=candidate.confidence,
-            background=WHITE,
-        )
-        for k, candidate in enumerate(done.selected)
-    ]
+    views = []
+    for k, chosen in enumerate(done.selected):
+        own = {"weights": chosen.confidence, "background": WHITE}
+        given = f"whole-round1-{k}.png", chosen.view.camera, "train", chosen.denoised
+        views.append(igsr.PseudoView(*given, **own))
     photos = igsr.Capture(capture.path, [*capture.train_views, *views])
     fitted = scenes.fit(photos, STEPS, backend="cpu", seed=seed_of_round(0, 1))
     assert same(fitted, done.splats)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import refinements
 import scenes
+from capture_files import assert_refused
 
 import igsr
 from igsr.capture import Capture, Points, View
@@ -18,7 +20,7 @@ from igsr.fitting import checkpoint as checkpoints
 from igsr.fitting import fit_capture, train
 from igsr.floaters.photo_evidence import behind_masks
 from igsr.rendering.renders import render
-from igsr.splats import PARAMETERS, Splats, joined
+from igsr.splats import PARAMETERS, joined
 from igsr.transients import EVIDENT_FRACTION, find_transients
 from igsr.transients.regions import box_sums, labels, window_max, window_min
 
@@ -28,20 +30,13 @@ SIZE = 96
 def wall(depth=0.0, count=90, seed=0):
     """A wall of small, flat, opaque splats across the cameras' view, with smooth colors."""
     random = np.random.default_rng(seed)
-    x, y = np.meshgrid(np.linspace(-2.2, 2.2, count), np.linspace(-2.2, 2.2, count))
-    means = np.stack([x, y, np.full_like(x, depth)], axis=-1).reshape(-1, 3)
+    side = np.linspace(-2.2, 2.2, count)
+    means = np.stack(np.meshgrid(side, side, depth), axis=-1).reshape(-1, 3)
     knots = random.uniform(0.1, 0.9, size=(10, 10, 3))
     at = np.linspace(0.0, 9.0, count)
     near = np.maximum(0.0, 1.0 - np.abs(at[:, None] - np.arange(10.0)))
     colors = np.einsum("yi,xj,ijc->yxc", near, near, knots).reshape(-1, 3)
-    return Splats(
-        means=means.astype(np.float32),
-        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (len(means), 1)),
-        scales=np.log(np.tile(np.array([0.03, 0.03, 0.01], np.float32), (len(means), 1))),
-        opacities=np.full(len(means), 2.0, np.float32),
-        sh=((colors - 0.5) / 0.2820948).astype(np.float32)[:, None],
-        origin=np.zeros(3),
-    )
+    return scenes.round_splats(means, [0.03, 0.03, 0.01], color=colors[:, None])
 
 
 WALL = wall()
@@ -110,21 +105,12 @@ def noisy(view, seed):
     return replace(view, image=np.clip(view.image + noise, 0, 255).astype(np.uint8))
 
 
-def with_highlight(view):
-    image = view.image.copy()
-    image[40:43, 40:43] = 255
-    return replace(view, image=image)
-
-
-CHANGES = [lambda view: view, brighter, with_highlight]
-CHANGES += [lambda view, seed=seed: noisy(view, seed) for seed in range(3)]
-
-
-@pytest.mark.parametrize("change", CHANGES)
-def test_static_photos_have_no_masks(change):
+def test_static_photos_have_no_masks():
     views = photos()
-    views[2] = change(views[2])
-    assert masked(find(views)) == []
+    with_highlight = with_figure(views[2], 40, 40, 3, 3, 255)[0]
+    changed = [views[2], brighter(views[2]), with_highlight]
+    for view in changed + [noisy(views[2], seed) for seed in range(3)]:
+        assert masked(find([*views[:2], view, *views[3:]])) == []
 
 
 def test_overexposed_pixels_may_have_any_bright_color():
@@ -171,8 +157,8 @@ def test_regions():
     number = labels(mask)
     assert number[1, 1] == number[2, 2] != number[5, 6] == number[5, 7]
     assert sorted(np.unique(number)) == [0, 1, 2]
-    assert (labels(np.ones((3, 4), np.bool_)) == 1).all()
-    assert (labels(np.zeros((3, 4), np.bool_)) == 0).all()
+    for value in (0, 1):
+        assert (labels(np.full((3, 4), value, np.bool_)) == value).all()
     # The ends of a snake are one region.
     snake = np.zeros((9, 9), np.bool_)
     snake[::2] = True
@@ -182,10 +168,7 @@ def test_regions():
     assert not window_max(mask, 1)[0, 3]
     assert not window_min(mask, 1).any()
     assert window_min(np.ones((3, 3), np.bool_), 2).all()
-    sums = box_sums(mask, 1)
-    assert sums[1, 1] == 2
-    assert sums[6, 8] == 1
-    assert sums[0, 8] == 0
+    assert box_sums(mask, 1)[[1, 6, 0], [1, 8, 8]].tolist() == [2, 1, 0]
 
 
 @pytest.fixture(scope="module")
@@ -211,19 +194,9 @@ def single_steps(monkeypatch):
 VISITED = {"photos/1.png", "photos/4.png"}
 STEPS = 120
 LOOKS = [round(part * STEPS) for part in (0.3, 0.5, 0.7)]
-OPTIONS = {
-    "steps": STEPS,
-    "backend": "cpu",
-    "max_splats": 9000,
-    "density": "fixed",
-    "coarse_to_fine": False,
-    "start": "points",
-    "sh_degree": 2,
-    "dropout": 0.0,
-    "learning_rate": 3.0,
-    "remove_floaters": False,
-    "backdrop": False,
-}
+OPTIONS = {"steps": STEPS, "backend": "cpu", "max_splats": 9000, "sh_degree": 2, "dropout": 0.0}
+OPTIONS |= {"density": "fixed", "start": "points", "learning_rate": 3.0}
+OPTIONS |= dict.fromkeys(("coarse_to_fine", "remove_floaters", "backdrop"), False)
 #: Options of fits that continue from splats.
 CONTINUED = {"sh_degree": 0, "steps": 60, "transients": "on"}
 
@@ -245,12 +218,8 @@ def test_a_fit_does_not_learn_transient_objects(static, visited, whole):
     for name, mask in on.masks.items():
         assert on.masked[name] == pytest.approx(1.0 - mask.mean())
     photo, (_, where) = static.views[1], with_figure(static.views[1])
-    before, after = (
-        np.abs(render(splats, photo.camera, backend="cpu").color - photo.image / 255.0)[
-            where
-        ].mean()
-        for splats in (off.splats, on.splats)
-    )
+    renders = (render(one.splats, photo.camera, backend="cpu").color for one in (off, on))
+    before, after = (np.abs(color - photo.image / 255.0)[where].mean() for color in renders)
     assert after < 0.7 * before
 
 
@@ -284,11 +253,9 @@ def test_a_fit_starts_over_with_the_first_masks(visited, starts):
     assert starts == [set(), VISITED]
 
 
-def test_a_fit_that_continues_from_splats_does_not_start_over(visited):
-    events = []
-    result = fit(visited, report=events.append, start=WALL, sh_degree=0)
-    assert result.masked.keys() == VISITED
-    assert [event.done for event in events] == sorted(event.done for event in events)
+def test_a_fit_that_continues_from_splats_does_not_start_over(visited, starts):
+    assert fit(visited, start=WALL, sh_degree=0).masked.keys() == VISITED
+    assert starts == [set()]
 
 
 def test_a_fit_continues_if_masks_leave_too_little_to_start_over(visited, whole, monkeypatch):
@@ -366,10 +333,14 @@ def test_a_stopped_fit_resumes_with_the_same_masks_and_bits(
     assert resumed.capture == whole.capture
 
 
-@pytest.mark.usefixtures("single_steps")
-def test_ctrl_c_saves_a_fit_that_started_over(visited, tmp_path, monkeypatch):
+@pytest.fixture
+def saved_every_30_steps(single_steps, monkeypatch):
     monkeypatch.setattr(train, "CHECKPOINT_STEPS", 30)
     monkeypatch.setattr(train, "CHECKPOINT_SECONDS", 1e9)
+
+
+@pytest.mark.usefixtures("saved_every_30_steps")
+def test_ctrl_c_saves_a_fit_that_started_over(visited, tmp_path, monkeypatch):
     path, fit_event, calls = tmp_path / "checkpoint.npz", train.fit_event, []
 
     def interrupted(*arguments, **named):
@@ -384,10 +355,8 @@ def test_ctrl_c_saves_a_fit_that_started_over(visited, tmp_path, monkeypatch):
     assert checkpoints.load_checkpoint(path)[0]["step"] == [20]
 
 
-@pytest.mark.usefixtures("single_steps")
+@pytest.mark.usefixtures("saved_every_30_steps")
 def test_a_fit_that_started_over_is_saved_at_once(visited, tmp_path, monkeypatch):
-    monkeypatch.setattr(train, "CHECKPOINT_STEPS", 30)
-    monkeypatch.setattr(train, "CHECKPOINT_SECONDS", 1e9)
     saved, save = [], checkpoints.CheckpointFile.save
 
     def watched(file, state, *others):
@@ -402,33 +371,25 @@ def test_a_fit_that_started_over_is_saved_at_once(visited, tmp_path, monkeypatch
 def test_an_interrupted_search_is_repeated(visited, whole, tmp_path, monkeypatch):
     path = tmp_path / "checkpoint.npz"
 
-    def interrupted(*_, **__):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patched:
-        patched.setattr("igsr.fitting.transient_masks.find_transients", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            fit(visited, checkpoint=path)
+    interrupted = Mock(side_effect=KeyboardInterrupt)
+    monkeypatch.setattr("igsr.fitting.transient_masks.find_transients", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        fit(visited, checkpoint=path)
+    monkeypatch.undo()
     assert fit(visited, checkpoint=path, resume=True).splats == whole.splats
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("transient_masks", np.zeros(3, np.uint8)),
-        ("transient_masks", np.zeros(6 * SIZE * SIZE // 8, np.int64)),
-        ("transients_looked", np.zeros(2, np.int64)),
-        ("transients_looked", np.array([-7])),
-        ("transients_looked", np.array([0.5])),
-    ],
-)
-def test_damaged_masks_are_named(visited, tmp_path, name, value):
-    path = tmp_path / "checkpoint.npz"
-    fit(visited, checkpoint=path, steps=10)
-    state, settings = checkpoints.load_checkpoint(path)
-    checkpoints.save_checkpoint(path, {**state, name: value}, settings)
-    with pytest.raises(igsr.IgsrError, match=f"cannot be used: {name}"):
-        fit(visited, checkpoint=path, steps=10, resume=True)
+def test_damaged_masks_are_named(visited, tmp_path):
+    options = {"checkpoint": tmp_path / "checkpoint.npz", "steps": 10}
+    fit(visited, **options)
+    state, settings = checkpoints.load_checkpoint(options["checkpoint"])
+    masks = np.zeros(3, np.uint8), np.zeros(6 * SIZE * SIZE // 8, np.int64)
+    looked = np.zeros(2, np.int64), np.array([-7]), np.array([0.5])
+    for name, values in (("transient_masks", masks), ("transients_looked", looked)):
+        for value in values:
+            damaged = {**state, name: value}
+            checkpoints.save_checkpoint(options["checkpoint"], damaged, settings)
+            assert_refused(f"cannot be used: {name}", fit, visited, resume=True, **options)
 
 
 def test_cpu_and_gpu_mask_alike(visited):
@@ -463,10 +424,9 @@ def test_a_refinement_keeps_the_masks_of_its_first_fit(ball_photos, monkeypatch,
 
     def found(splats, views, before, **_):
         searches.append(len(views))
-        masks = [None] * len(views)
-        masks[0] = np.zeros(views[0].image.shape[:2], np.bool_)
-        masks[0][:5] = True
-        return masks
+        first = np.zeros(views[0].image.shape[:2], np.bool_)
+        first[:5] = True
+        return [first, *[None] * (len(views) - 1)]
 
     monkeypatch.setattr("igsr.fitting.transient_masks.find_transients", found)
     refinements.refine(ball_photos, 1, refinements.lying, transients="on")
