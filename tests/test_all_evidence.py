@@ -27,6 +27,7 @@ from igsr.geometry.pose_errors import pose_accuracy, pose_errors
 from igsr.geometry.similarity import similarity_between
 
 COUNT = 5
+ANGLES = [0.3 * (i - COUNT / 2) for i in range(COUNT)]
 
 
 def turned(camera, degrees, moved, seed):
@@ -38,12 +39,28 @@ def turned(camera, degrees, moved, seed):
 
 @pytest.fixture(scope="module")
 def truth():
-    return [rooms.camera(0.3 * (i - COUNT / 2)) for i in range(COUNT)]
+    return [rooms.camera(angle) for angle in ANGLES]
 
 
 @pytest.fixture(scope="module")
 def photos(truth):
-    return [replace(photo, device="phone") for photo in rooms.photos(truth)]
+    return photos_of(truth)
+
+
+def photos_of(cameras):
+    return [replace(photo, device="phone") for photo in rooms.photos(cameras)]
+
+
+def without_features(photos, index, image=128):
+    """The photos, of which one shows a plain gray or another image."""
+    blank = replace(photos[index], image=np.full_like(photos[index].image, image))
+    return [*photos[:index], blank, *photos[index + 1 :]]
+
+
+def check_unchanged(found, start):
+    """All cameras are as predicted."""
+    assert rests_on(found) == ["network"] * len(start)
+    assert all(one is other.camera for one, other in zip(found.cameras, start, strict=True))
 
 
 def predicted(truth, degrees=3.0, moved=0.2):
@@ -121,13 +138,11 @@ def test_the_same_seed_gives_the_same_bits(truth, photos, colmap_places_none):
 @pytest.mark.parametrize("fewest", [3, 99])
 def test_a_photo_without_matches_keeps_its_prediction(truth, photos, monkeypatch, fewest):
     monkeypatch.setattr(all_evidence, "MIN_PLACED", fewest)
-    blank = replace(photos[2], image=np.full_like(photos[2].image, 128))
-    shown = [*photos[:2], blank, *photos[3:]]
     start = predicted(truth)
-    found = together(shown, start)
+    found = together(without_features(photos, 2), start)
     assert rests_on(found) == ["features", "features", "network", "features", "features"]
     (warning,) = found.warnings
-    assert warning.startswith(f"Cameras of {blank.name} are as The network predicts them, with")
+    assert warning.startswith(f"Cameras of {photos[2].name} are as The network predicts them, with")
     # The others are accurate, and this one is as predicted relative to them.
     others = (0, 1, 3, 4)
     right = [found.cameras[i] for i in others]
@@ -144,24 +159,20 @@ def test_a_photo_without_matches_keeps_its_prediction(truth, photos, monkeypatch
 
 def test_photos_without_matches_keep_their_predictions(truth, photos):
     random = np.random.default_rng(0)
-    noise = [
-        replace(photo, image=random.integers(0, 256, photo.image.shape, dtype=np.uint8))
-        for photo in photos
-    ]
+    images = random.integers(0, 256, (COUNT, *photos[0].image.shape), dtype=np.uint8)
+    noise = [replace(photo, image=one) for photo, one in zip(photos, images, strict=True)]
     start = predicted(truth)
     found = together(noise, start)
-    assert rests_on(found) == ["network"] * COUNT
-    assert all(one is other.camera for one, other in zip(found.cameras, start, strict=True))
+    check_unchanged(found, start)
     assert found.warnings[0].startswith("Cameras of all photos are as The network predicts them")
 
 
 def test_a_photo_of_something_else_moves_no_other(truth, photos):
     random = np.random.default_rng(0)
     other = random.integers(0, 256, photos[2].image.shape, dtype=np.uint8)
-    shown = [*photos[:2], replace(photos[2], image=other), *photos[3:]]
     start = predicted(truth)
     start[2] = replace(start[2], camera=turned(truth[2], 120.0, 3.0, 9))
-    found = together(shown, start)
+    found = together(without_features(photos, 2, other), start)
     assert rests_on(found)[2] == "network"
     others = (0, 1, 3, 4)
     cameras = [found.cameras[i] for i in others]
@@ -179,23 +190,17 @@ def test_a_wrong_depth_of_one_photo_moves_no_other(truth, photos, colmap_places_
     assert moved["center"] < 2.0 * right["center"]
 
 
-def test_an_adjustment_far_from_the_prediction_is_not_used(
-    truth, photos, monkeypatch, colmap_places_none
-):
+@pytest.mark.usefixtures("colmap_places_none")
+def test_an_adjustment_far_from_the_prediction_is_not_used(truth, photos, monkeypatch):
     monkeypatch.setattr(all_evidence, "MAX_ANGLE", 0.5)
     start = predicted(truth)
     found = together(photos, start)
-    assert rests_on(found) == ["network"] * COUNT
-    assert found.warnings[0].startswith(
-        "Bundle adjustment contradicts the prediction of The network"
-    )
-    assert all(one is other.camera for one, other in zip(found.cameras, start, strict=True))
+    check_unchanged(found, start)
+    assert found.warnings[0].startswith("Bundle adjustment contradicts the prediction of The")
 
 
 def test_a_prediction_that_contradicts_features_is_not_used(truth, photos):
-    blank = replace(photos[4], image=np.full_like(photos[4].image, 128))
-    start = predicted(truth, degrees=90.0)
-    found = together([*photos[:4], blank], start)
+    found = together(without_features(photos, 4), predicted(truth, degrees=90.0))
     assert rests_on(found) == ["features"] * 4 + [None]
     assert pose_errors(found.cameras[:4], truth[:4])["rotation"] < 0.2
     assert found.warnings[-1] == (
@@ -211,8 +216,7 @@ def test_few_features_that_contradict_the_prediction_are_not_used(truth, photos)
     elsewhere = [rooms.camera(2.0 + 1.5 * i) for i in range(3)]
     start = predicted([*elsewhere, *(rooms.camera(0.2 * i) for i in range(4))])
     found = together([*photos[:3], *others], start)
-    assert rests_on(found) == ["network"] * 7
-    assert all(one is other.camera for one, other in zip(found.cameras, start, strict=True))
+    check_unchanged(found, start)
     assert found.warnings[0].startswith("Features place 3 of 7 photos, but not where")
 
 
@@ -225,31 +229,23 @@ def test_features_place_a_photo_without_a_prediction(truth, photos):
 
 
 def test_portrait_landscape_and_a_principal_point_off_the_middle(colmap_places_none):
-    cameras = [rooms.camera(0.3 * (i - COUNT / 2)) for i in range(COUNT)]
-    for i in (1, 3):
-        cameras[i] = rooms.camera(0.3 * (i - COUNT / 2), width=180, height=240)
-    photos = [replace(photo, device="phone") for photo in rooms.photos(cameras)]
+    sizes = [(240, 180), (180, 240)] * COUNT
+    cameras = [rooms.camera(ANGLES[i], 200.0, *sizes[i]) for i in range(COUNT)]
+    photos = photos_of(cameras)
     found = together(photos, predicted(cameras))
     assert rests_on(found) == ["features"] * COUNT
     assert pose_errors(found.cameras, cameras)["rotation"] < 0.2
     for camera in cameras:
         camera.K[0, 2] += 0.04 * camera.width
-    photos = [replace(photo, device="phone") for photo in rooms.photos(cameras)]
-    start = [
-        replace(one, camera=replace(one.camera, K=_centerd(one.camera)))
-        for one in predicted(cameras)
-    ]
+    photos = photos_of(cameras)
+    start = predicted(cameras)
+    for one in start:
+        one.camera.K[:2, 2] = one.camera.width / 2, one.camera.height / 2
     found = together(photos, start)
     # The principal point is not estimated, so all cameras are rotated alike; relative to each other
     # they are still better than predicted.
     before = pose_accuracy([one.camera for one in start], cameras)["rotation"]
     assert pose_accuracy(found.cameras, cameras)["rotation"] < 0.3 * before
-
-
-def _centerd(camera):
-    K = camera.K.copy()
-    K[:2, 2] = camera.width / 2, camera.height / 2
-    return K
 
 
 def test_two_photos(truth, photos):
@@ -287,12 +283,10 @@ def test_bundle_adjustment_of_the_estimator(truth, photos):
 
 
 def test_evidence_is_kept_and_written(truth, photos, tmp_path):
-    blank = replace(photos[2], image=np.full_like(photos[2].image, 128))
-    shown = [*photos[:2], blank, *photos[3:]]
+    shown = without_features(photos, 2)
     found = Da3(RoughPredictor(truth))(shown)
-    kept = KeptCameras(
-        FoundCameras.of(shown, found, {"estimator": "da3"}), {}, Usage(0.0, 0.0, None)
-    )
+    of_photos = FoundCameras.of(shown, found, {"estimator": "da3"})
+    kept = KeptCameras(of_photos, {}, Usage(0.0, 0.0, None))
     write_cameras_file(tmp_path / "cameras.npz", kept)
     again = read_cameras_file(tmp_path / "cameras.npz").found
     assert again.estimate.evidence == found.evidence

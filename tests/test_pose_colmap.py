@@ -57,8 +57,7 @@ def test_cameras_points_and_tracks_are_right(found):
         assert camera.K[:2, 2].tolist() == [120.0, 90.0]
     assert not any(found.lenses), "the photos have no distortion"
     # The points lie on the walls.
-    to_true = similarity_between(found.cameras, CAMERAS)
-    xyz = to_true.scale * found.points.xyz @ to_true.rotation.T + to_true.translation
+    xyz = similarity_between(found.cameras, CAMERAS).apply(found.points.xyz.T).T
     off = [
         np.abs(xyz @ np.array(normal) - offset) / np.linalg.norm(normal)
         for normal, offset, _, _ in rooms.WALLS
@@ -87,7 +86,6 @@ def test_the_same_seed_gives_the_same_bits_without_output(photos, found, capfd):
 
     again = Colmap()(photos, seed=3, progress=progress)
     assert matrices(again.cameras) == matrices(found.cameras)
-    np.testing.assert_array_equal(again.points.xyz, found.points.xyz)
     assert list(stages) == ["features", "matching", "mapping"]
     for steps in stages.values():
         assert steps == sorted(steps)
@@ -157,11 +155,10 @@ def test_photos_of_another_scene_are_named_and_the_others_placed(photos):
     with pytest.raises(igsr.IgsrError, match=r"No cameras found: the 2 photos \(1\.png"):
         igsr.find_cameras([photos[1], stranger], "colmap")
     away = [CAMERAS[2], rooms.camera(np.pi)]  # back to back
-    with pytest.raises(igsr.IgsrError, match="too few matches"):
-        igsr.find_cameras(rooms.photos(away), "colmap")
     blank = [Photo(f"{i}.png", np.full((60, 80, 3), 200, dtype=np.uint8)) for i in range(3)]
-    with pytest.raises(igsr.IgsrError, match="too few matches"):
-        igsr.find_cameras(blank, "colmap")
+    for unusable in (rooms.photos(away), blank):
+        with pytest.raises(igsr.IgsrError, match="too few matches"):
+            igsr.find_cameras(unusable, "colmap")
     with pytest.raises(igsr.IgsrError, match=r"at least 2 photos; .*1\.png"):
         igsr.find_cameras(photos[1:2], "colmap")
 
@@ -186,9 +183,8 @@ def test_few_pairs_of_many_photos_are_matched(monkeypatch):
 
 
 def test_a_warning_says_how_long_many_photos_take(monkeypatch):
-    for step in ("list_photos", "find_features"):
+    for step in ("list_photos", "find_features", "matched"):
         monkeypatch.setattr(estimator, step, lambda *arguments: None)
-    monkeypatch.setattr(estimator, "matched", lambda *arguments: None)
     monkeypatch.setattr(estimator, "mapped", lambda *arguments, **more: Mapped(None, False, 0))
     tiny = [Photo(f"{i}.png", np.zeros((2, 2, 3), dtype=np.uint8)) for i in range(500)]
     with (
@@ -210,25 +206,22 @@ def test_similar_photos_are_found_by_their_features(photos, tmp_path):
     assert counts[:3, 3].max() < pairs.MIN_PRESELECTION_MATCHES
 
 
+TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+OTHER_WORLD = Similarity(2.5, TURN, np.array([1.0, -2.0, 3.0]))
+
+
 class Known:
-    """An estimator that knows the cameras of some photos, in a world of its own.
+    """An estimator that knows the cameras of some photos, in a world of its own."""
 
-    Attributes:
-        calls: names and seeds of the estimators that were called.
-    """
-
-    calls: ClassVar[list[tuple[str, int]]] = []
+    calls: ClassVar = []  # names and seeds of the estimators that were called
 
     def __init__(self, name, placed, world=None):
-        self.name, self.placed, self.world = name, placed, world
+        self.name, self.placed = name, placed
+        self.cameras = [world.camera(camera) for camera in CAMERAS] if world else CAMERAS
 
     def __call__(self, photos, *, seed=0, progress=None):
         Known.calls.append((self.name, seed))
-        cameras = [
-            CAMERAS[i] if self.world is None else self.world.camera(CAMERAS[i])
-            for i in range(len(photos))
-        ]
-        placed = [camera if i in self.placed else None for i, camera in enumerate(cameras)]
+        placed = [self.cameras[i] if i in self.placed else None for i in range(len(photos))]
         nothing = [None] * len(photos)
         return Estimate(placed, None, nothing, nothing, [f"A warning by {self.name}."])
 
@@ -245,10 +238,6 @@ def registered(monkeypatch):
             monkeypatch.setitem(registry.ESTIMATORS, name, entry)
 
     return replace_by
-
-
-TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-OTHER_WORLD = Similarity(2.5, TURN, np.array([1.0, -2.0, 3.0]))
 
 
 def test_auto_asks_no_network_if_colmap_places_all(photos, registered):
@@ -276,15 +265,13 @@ def test_auto_adds_a_networks_cameras_for_photos_that_colmap_cannot_place(photos
             assert view.pose_evidence.rests_on == "network"
 
 
-def test_auto_without_weights_keeps_what_colmap_placed(photos, registered):
+def test_auto_keeps_what_colmap_placed_or_takes_the_network_alone(photos, registered):
     registered(colmap=Known("colmap", [0, 1, 3]))
     with pytest.warns(UserWarning, match="A warning by colmap"):
         capture = igsr.find_cameras(photos)
     assert [view.name for view in capture.views] == ["0.png", "1.png", "3.png"]
     assert Known.calls == [("colmap", 0)]
-
-
-def test_auto_takes_the_network_alone_if_colmap_places_too_few(photos, registered):
+    # COLMAP places too few.
     registered(colmap=Known("colmap", [0, 1]), da3=Known("da3", range(6), OTHER_WORLD))
     with pytest.warns(UserWarning, match="A warning by da3"):
         capture = igsr.find_cameras(photos)

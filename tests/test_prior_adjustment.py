@@ -18,7 +18,6 @@ from igsr.cameras.prior_adjustment import (
     adjusted_bundle,
     covariances,
 )
-from igsr.geometry.bundle_equations import Equations
 from igsr.geometry.pose_errors import pose_accuracy, pose_errors
 
 COUNT = 5
@@ -53,16 +52,12 @@ def started(bundle, cameras, seed=3):
     return replace(bundle, cameras=cameras, points=bundle.points + noise)
 
 
-def neighbours():
-    return [(k, k + 1) for k in range(COUNT - 1)]
-
-
-def threes():
-    return [(k, k + 1, k + 2) for k in range(COUNT - 2)]
+PAIRS = [(k, k + 1) for k in range(COUNT - 1)]
+THREES = [(k, k + 1, k + 2) for k in range(COUNT - 2)]
 
 
 def test_derivatives_are_those_of_the_cost():
-    bundle, seen = scene(threes(), per_group=4)
+    bundle, seen = scene(THREES, per_group=4)
     depth = seen.depth * np.exp(np.random.default_rng(0).normal(scale=0.1, size=len(seen.depth)))
     depth[::3] = np.nan
     seen = replace(seen, depth=depth)
@@ -76,13 +71,7 @@ def test_derivatives_are_those_of_the_cost():
     slope = prior[:-1, -1].copy()
     np.add.at(slope, equations.column[:, :-1], np.einsum("mrc,mr->mc", value, errors))
     size = equations.width - 1
-    nowhere = Equations(
-        equations.point,
-        equations.column,
-        np.zeros_like(equations.value),
-        equations.of_point,
-        equations.width,
-    )
+    nowhere = replace(equations, value=np.zeros_like(equations.value))
     for k in range(size):
         costs = []
         for sign in (1.0, -1.0):
@@ -96,7 +85,7 @@ def test_derivatives_are_those_of_the_cost():
 
 
 def test_points_in_three_photos_outweigh_the_prediction():
-    bundle, seen = scene(threes())
+    bundle, seen = scene(THREES)
     wanted = predicted()
     found = adjusted_bundle(started(bundle, wanted), seen, wanted, SPREAD, 1.0)
     before, after = (pose_errors(one, TRUTH) for one in (wanted, found.cameras))
@@ -105,7 +94,7 @@ def test_points_in_three_photos_outweigh_the_prediction():
 
 
 def test_the_prediction_decides_if_points_are_in_two_photos():
-    bundle, seen = scene(neighbours())
+    bundle, seen = scene(PAIRS)
     noise = np.random.default_rng(1).normal(scale=1.0, size=seen.xy.shape)
     seen = replace(seen, xy=seen.xy + noise, depth=np.full(len(seen.depth), np.nan))
     wanted = predicted()
@@ -123,7 +112,7 @@ def test_the_prediction_decides_if_points_are_in_two_photos():
 
 
 def test_depths_decide_too_and_wrong_ones_have_no_influence():
-    bundle, seen = scene(neighbours())
+    bundle, seen = scene(PAIRS)
     wanted = predicted(moved=0.3)
     exact = adjusted_bundle(started(bundle, wanted), seen, wanted, SPREAD, 1.0)
     none = replace(seen, depth=np.full(len(seen.depth), np.nan))
@@ -131,14 +120,13 @@ def test_depths_decide_too_and_wrong_ones_have_no_influence():
     errors = [pose_errors(one.cameras, TRUTH)["center"] for one in (exact, without)]
     assert errors[0] < 0.8 * errors[1]
     wrong = np.where(seen.view == 2, seen.depth * 3.0, seen.depth)
-    found = adjusted_bundle(
-        started(bundle, wanted), replace(seen, depth=wrong), wanted, SPREAD, 1.0
-    )
+    wrong = replace(seen, depth=wrong)
+    found = adjusted_bundle(started(bundle, wanted), wrong, wanted, SPREAD, 1.0)
     assert pose_errors(found.cameras, TRUTH)["center"] < 2.0 * errors[0]
 
 
 def test_a_wrong_prediction_has_no_influence():
-    bundle, seen = scene(threes())
+    bundle, seen = scene(THREES)
     wanted = predicted()
     right = adjusted_bundle(started(bundle, wanted), seen, wanted, SPREAD, 1.0)
     start = started(bundle, list(wanted))
@@ -150,7 +138,7 @@ def test_a_wrong_prediction_has_no_influence():
 
 
 def test_wrong_matches_have_little_influence():
-    bundle, seen = scene(threes())
+    bundle, seen = scene(THREES)
     wanted = predicted()
     xy = seen.xy.copy()
     xy[::10] += np.random.default_rng(0).normal(scale=15.0, size=xy[::10].shape)
@@ -159,7 +147,7 @@ def test_wrong_matches_have_little_influence():
 
 
 def test_covariances_match_errors():
-    bundle, seen = scene(threes(), per_group=20)
+    bundle, seen = scene(THREES, per_group=20)
     errors, expected = [], []
     for seed in range(6):
         random = np.random.default_rng(seed)
@@ -175,9 +163,7 @@ def test_covariances_match_errors():
 
 def test_a_camera_without_points_has_the_deviations_of_the_prediction():
     bundle, seen = scene([(0, 1, 2), (1, 2, 3)])
-    turn, move = zip(
-        *(deviations(one) for one in covariances(bundle, seen, TRUTH, SPREAD)), strict=True
-    )
+    turn, move = np.transpose([deviations(c) for c in covariances(bundle, seen, TRUTH, SPREAD)])
     assert turn[4] > 10.0 * turn[1]
     assert move[4] > 10.0 * move[1]
     assert turn[4] == pytest.approx(SPREAD.rotation, rel=0.3)
