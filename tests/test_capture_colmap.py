@@ -112,19 +112,14 @@ def test_features_of_removed_points_are_ignored(tmp_path):
     assert load_capture(tmp_path).points.tracks is None
 
 
-@pytest.mark.parametrize(
-    ("features", "words"),
-    [
-        *((bad, "txt, line 2 is not of the form X Y P") for bad in ("1 2", "1 2 7 3", "1 two 7")),
-        ("1 2 7.5", r"images\.txt, line 2 is not of the form X Y POINT3D_ID"),
-        ("1 2 99999999999999999999", r"images\.txt, line 2 is not of the form X Y POINT3D_ID"),
-        ("1 nan 7", r"images\.txt: 0\.png sees a point at no finite place"),
-    ],
-)
-def test_bad_features_are_named(features, words, tmp_path):
+def test_bad_features_are_named(tmp_path):
     write_text_model(tmp_path, point="7 0 0 1 10 20 30 0.5 1 0")
-    (tmp_path / "sparse/0/images.txt").write_text(f"1 1 0 0 0 0 0 0 1 0.png\n{features}\n")
-    assert_refused(words, load_capture, tmp_path)
+    malformed = "1 2", "1 2 7 3", "1 two 7", "1 2 7.5", "1 2 99999999999999999999"
+    words = dict.fromkeys(malformed, r"images\.txt, line 2 is not of the form X Y POINT3D_ID")
+    words["1 nan 7"] = r"images\.txt: 0\.png sees a point at no finite place"
+    for features in words:
+        (tmp_path / "sparse/0/images.txt").write_text(f"1 1 0 0 0 0 0 0 1 0.png\n{features}\n")
+        assert_refused(words[features], load_capture, tmp_path)
 
 
 def test_poses_in_a_rig_are_products(tmp_path):

@@ -37,9 +37,8 @@ def write_blender(folder):
         for index, number in enumerate(numbers):
             save(folder / f"{split}/r_{index}.png", photo(number, channels=4))
             pose = opengl_pose(viewmats[number])
-            frames.append(
-                {"file_path": f"./{split}/r_{index}", "rotation": 0.1, "transform_matrix": pose}
-            )
+            frame = {"file_path": f"./{split}/r_{index}", "rotation": 0.1}
+            frames.append(frame | {"transform_matrix": pose})
         write_json(folder / f"transforms_{split}.json", {"camera_angle_x": ANGLE, "frames": frames})
     return viewmats
 
@@ -52,9 +51,9 @@ def test_blender_scene(tmp_path):
     assert [view.name for view in capture.views] == names
     assert [view.split for view in capture.views] == ["train"] * 3 + ["test"] * 2
     focal = 0.5 * WIDTH / math.tan(0.5 * ANGLE)
+    K = [[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]]
     for index, view in enumerate(capture.views):
         np.testing.assert_allclose(view.camera.viewmat, viewmats[index], atol=1e-12)
-        K = [[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]]
         np.testing.assert_allclose(view.camera.K, K)
         np.testing.assert_array_equal(view.image, photo(index, channels=4))
         assert view.mask is None
@@ -164,16 +163,9 @@ def test_point_cloud(kind, tmp_path):
 def write_ply(path, kind="ascii", count=2):
     rows = [(1.0, 2.0, 3.0, 0.5, 10, 20, 30), (-1.5, 0.25, 7.0, 0.5, 0, 255, 128)]
     names = ["float x", "float y", "double z", "float nx", "uchar red", "uchar green", "uchar blue"]
-    header = [
-        "ply",
-        f"format {kind} 1.0",
-        "comment made by a test",
-        f"element vertex {count}",
-        *(f"property {name}" for name in names),
-        "element face 1",
-        "property list uchar int vertex_indices",
-        "end_header\n",
-    ]
+    header = ["ply", f"format {kind} 1.0", "comment made by a test", f"element vertex {count}"]
+    header += [f"property {name}" for name in names]
+    header += ["element face 1", "property list uchar int vertex_indices", "end_header\n"]
     if kind == "ascii":
         body = "".join(" ".join(map(str, row)) + "\n" for row in rows).encode() + b"3 0 1 0\n"
     else:

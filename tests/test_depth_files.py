@@ -36,12 +36,12 @@ def depths(folder):
     return [view.depth for view in load_capture(folder).views]
 
 
-@pytest.mark.parametrize(("name", "unit"), [("1.png", None), ("1.npy", None), ("1.tif", 0.25)])
-def test_whole_numbers_are_millimeters_by_default(name, unit, tmp_path):
+def test_whole_numbers_are_millimeters_by_default(tmp_path):
     stored = np.round(DEPTH * 1000.0).astype(np.uint16)
-    fields = {} if unit is None else {"depth_unit_scale_factor": unit}
-    with_depth(tmp_path, name, stored, **fields)
-    assert depths(tmp_path)[1] == pytest.approx(stored * (unit or 1e-3), rel=1e-6)
+    quarters = {"depth_unit_scale_factor": 0.25}
+    for name, fields, unit in (("1.png", {}, 1e-3), ("1.npy", {}, 1e-3), ("1.tif", quarters, 0.25)):
+        with_depth(tmp_path, name, stored, **fields)
+        assert depths(tmp_path)[1] == pytest.approx(stored * unit, rel=1e-6)
 
 
 def test_channel_z_of_an_exr(tmp_path):

@@ -70,13 +70,11 @@ def test_photos_of_one_scene_are_kept(photos):
 
 def test_the_sharpest_photo_of_a_burst_is_kept(photos):
     burst = [blurred(photos[2], "a.jpg", 1.0), moved(photos[2], "b.jpg", 0), *photos]
-    kept, sentences = split_unfit(burst)
+    kept, (sentence,) = split_unfit(burst)
     best = {photo.name for photo in kept} & {"a.jpg", "b.jpg", "2.jpg"}
-    assert len(best) == 1
-    assert best != {"a.jpg"}
+    assert best in ({"b.jpg"}, {"2.jpg"})
     assert len(kept) == 8
-    assert len(sentences) == 1
-    assert "the same view as" in sentences[0]
+    assert "the same view as" in sentence
     # Photos of two phones from one place are kept: their lenses differ.
     assert len(split_unfit([*photos, replace(burst[1], device="another")])[0]) == 9
 

@@ -74,13 +74,11 @@ def test_frames_are_spread_over_the_path_not_over_time():
 
 
 def test_the_sharpest_frame_in_the_middle_of_a_span_is_taken():
-    places = np.linspace(0.0, 20.0, 400, endpoint=False)
     sharpness = np.ones(400)
     sharpness[[29, 45, 79]] = 2.0  # the middle of span 1 and of span 2; the edge of span 3
-    chosen = evenly_sharp(places, sharpness, max_frames=100)
+    chosen = evenly_sharp(np.arange(400) / 20.0, sharpness, max_frames=100)
     assert len(chosen) == 20
-    assert {29, 45} <= set(chosen)
-    assert 79 not in chosen
+    assert set(chosen) & {29, 45, 79} == {29, 45}
 
 
 @pytest.mark.parametrize("count", [1, 5, 12, 300])
