@@ -159,9 +159,7 @@ def test_damaged_photo_is_left_out_by_name(tmp_path, suffix):
     broken.write_bytes(b"no photo at all")
     for index in range(5):
         (tmp_path / f"d{index}.png").write_bytes(b"nothing")
-    with pytest.warns(
-        UserWarning, match=rf"6 of 8 .*b\{suffix} .*; so are d0\.png, .* and 2 more$"
-    ):
+    with pytest.warns(UserWarning, match=rf"6 of 8 .*b\{suffix} .*; so are d0\.png, .*"):
         assert len(read_photos(tmp_path)) == 2
     (tmp_path / "a.png").unlink()
     assert_refused(rf"b\{suffix} cannot be read as an image", read_photos, tmp_path)
@@ -172,7 +170,7 @@ def test_several_damaged_photos_are_one_sentence(tmp_path):
         save(tmp_path / f"{index}.png", photo(index))
     for index in range(3, 9):
         (tmp_path / f"{index}.png").write_bytes(b"nothing")
-    with pytest.warns(UserWarning, match=r"6 of 9 .*3\.png .*; so are 4\.png, .* and 2 more$"):
+    with pytest.warns(UserWarning, match=r"6 of 9 .*3\.png .*; so are 4\.png, .*8\.png$"):
         assert len(read_photos(tmp_path)) == 3
 
 

@@ -67,7 +67,6 @@ def test_views_are_denoised_with_trained_weights(trained):
         (["train", "--pairs", "ball"], "holds no .npz of pairs"),
         (["train", "--pairs", "pairs", "--features", "a", "--lpips", "alex"], "give one"),
         (["train", "--pairs", "pairs", "--loss", "lpips"], "needs a perceptual distance"),
-        (["train", "--pairs", "pairs", "--photos", "all"], "photos must be one of"),
         (["train", "--pairs", "pairs", "--width", "5"], "width must be even, from 2 to 256, not 5"),
         (["pairs", "ball", "--fits", "0"], "fits must be at least 1"),
         (["pairs", "ball", "--recipe", "burnt"], "recipe must be one of sparse, underfit, noise"),

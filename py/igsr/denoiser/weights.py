@@ -98,7 +98,7 @@ def _architecture(text: str | None, path: Path) -> Architecture:
         return Architecture(settings["width"], tuple(settings["blocks"]))
     except IgsrError as error:
         raise IgsrError(f"{path} has an unsupported architecture: {error}") from error
-    except (ValueError, TypeError, KeyError, RecursionError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise IgsrError(
             f"{path} does not record its architecture; it is not a denoiser of igsr"
         ) from error
