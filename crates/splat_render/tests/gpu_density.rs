@@ -67,8 +67,9 @@ fn same_after_original(gpu: &Arc<Gpu>, state: &FitState, run: &OriginalRun) -> F
     same(gpu, state, |device| device.original(run))
 }
 
-/// Names, and changes of the adapter.
-const WAYS: [(&str, fn(Gpu) -> Gpu); 4] = [
+/// A name, and a change of the adapter.
+type Way = (&'static str, fn(Gpu) -> Gpu);
+const WAYS: [Way; 4] = [
     ("as it is", |gpu| gpu),
     ("without subgroups", Gpu::without_subgroups),
     ("as discrete", Gpu::as_discrete),
