@@ -39,9 +39,6 @@ fn cameras(seed: u64) -> Vec<Camera> {
     (0..4).map(|_| random_camera(&mut rng, 90, 60)).collect()
 }
 
-/// A name, and a change of the adapter.
-type Way = (&'static str, fn(Gpu) -> Gpu);
-
 /// The state after a change on the host, checked against the GPU's. The change returns the number of
 /// moving splats.
 fn same(
@@ -70,6 +67,8 @@ fn same_after_original(gpu: &Arc<Gpu>, state: &FitState, run: &OriginalRun) -> F
     same(gpu, state, |device| device.original(run))
 }
 
+/// A name, and a change of the adapter.
+type Way = (&'static str, fn(Gpu) -> Gpu);
 const WAYS: [Way; 4] = [
     ("as it is", |gpu| gpu),
     ("without subgroups", Gpu::without_subgroups),
@@ -93,30 +92,6 @@ fn mcmc_gives_the_bits_of_the_host() {
     }
 }
 
-#[test]
-fn mcmc_leaves_dead_scenes_as_they_are() {
-    let mut state = amid_a_fit(1, 300, 1);
-    state.splats.opacities.fill(-8.0);
-    state.splats.means.fill([0.5; 3]);
-    state.splats.sh.fill([0.1; 3]);
-    let run = McmcRun { cameras: Vec::new(), target: 400, seed: 1 };
-    assert_eq!(same_after(&Arc::new(gpu()), &state, &run).splats.len(), 300);
-}
-
-/// Arrays larger than a binding are processed on the host.
-#[test]
-fn arrays_larger_than_a_binding_give_the_same() {
-    let state = amid_a_fit(3, 2000, 2);
-    let run = McmcRun { cameras: cameras(3), target: 2500, seed: 5 };
-    let small = Arc::new(gpu().with_binding_limit(200_000));
-    let before = small.host_bytes();
-    same_after(&small, &state, &run);
-    assert!(
-        small.host_bytes() - before > 4 * 2000 * 3 * (11 + 27) * 2,
-        "it was not done on the host"
-    );
-}
-
 /// Bytes between host and device in changes of 20 000, 40 000 and 40 000 splats.
 fn host_bytes(change: impl Fn(&mut GpuFit, usize)) -> [u64; 3] {
     let gpu = Arc::new(gpu());
@@ -129,18 +104,6 @@ fn host_bytes(change: impl Fn(&mut GpuFit, usize)) -> [u64; 3] {
     });
     println!("bytes of each run: {traffic:?}");
     traffic
-}
-
-#[test]
-fn mcmc_has_little_host_traffic() {
-    let traffic = host_bytes(|fit, splats| {
-        let run = McmcRun { cameras: cameras(2), target: splats + 2000, seed: 3 };
-        fit.mcmc(&run).unwrap();
-    });
-    // A sample of at most 10 000 centers, and tables: no more for more splats.
-    assert_eq!(traffic[1], traffic[2]);
-    assert!(traffic[0].abs_diff(traffic[1]) < 1000, "{traffic:?}");
-    assert!(traffic[0] < 1_000_000, "{traffic:?}");
 }
 
 fn original_run(max_splats: usize, extent: f32) -> OriginalRun {
@@ -214,8 +177,14 @@ fn original_control_without_work_only_sorts() {
 }
 
 #[test]
-fn if_all_would_be_pruned_all_stay() {
+fn scenes_without_a_living_splat_keep_all() {
     let gpu = Arc::new(gpu());
+    let mut dead = amid_a_fit(1, 300, 1);
+    dead.splats.opacities.fill(-8.0);
+    dead.splats.means.fill([0.5; 3]);
+    dead.splats.sh.fill([0.1; 3]);
+    let run = McmcRun { cameras: Vec::new(), target: 400, seed: 1 };
+    assert_eq!(same_after(&gpu, &dead, &run).splats.len(), 300);
     let mut state = sound(amid_a_fit(1, 300, 1));
     state.splats.opacities.fill(-8.0);
     let run = original_run(310, 1.0);
@@ -325,9 +294,15 @@ fn opacities_are_reset_as_on_the_host() {
 fn the_host_s_fallback_gives_the_same() {
     let state = amid_a_fit(3, 2000, 2);
     let small = Arc::new(gpu().with_binding_limit(200_000));
-    let before = small.host_bytes();
-    same_after_original(&small, &state, &original_run(2500, 1.0));
-    assert!(small.host_bytes() - before > 4 * 2000 * 3 * (11 + 27) * 2, "not on the host");
+    let mcmc = McmcRun { cameras: cameras(3), target: 2500, seed: 5 };
+    let runs: [&dyn Fn(); 2] = [&|| drop(same_after(&small, &state, &mcmc)), &|| {
+        drop(same_after_original(&small, &state, &original_run(2500, 1.0)))
+    }];
+    for run in runs {
+        let before = small.host_bytes();
+        run();
+        assert!(small.host_bytes() - before > 4 * 2000 * 3 * (11 + 27) * 2, "not on the host");
+    }
     // The old scene fits, the new one does not.
     let tight = Arc::new(gpu().with_binding_limit(2000 * 27 * 4));
     same_after_original(&tight, &state, &original_run(4000, 1e-3));
@@ -336,7 +311,15 @@ fn the_host_s_fallback_gives_the_same() {
 }
 
 #[test]
-fn original_control_has_little_host_traffic() {
+fn density_control_has_little_host_traffic() {
+    let traffic = host_bytes(|fit, splats| {
+        let run = McmcRun { cameras: cameras(2), target: splats + 2000, seed: 3 };
+        fit.mcmc(&run).unwrap();
+    });
+    // A sample of at most 10 000 centers, and tables: no more for more splats.
+    assert_eq!(traffic[1], traffic[2]);
+    assert!(traffic[0].abs_diff(traffic[1]) < 1000, "{traffic:?}");
+    assert!(traffic[0] < 1_000_000, "{traffic:?}");
     let traffic = host_bytes(|fit, splats| {
         let left = fit.original(&original_run(2 * splats, 1.0)).unwrap();
         fit.reset_opacities().unwrap();

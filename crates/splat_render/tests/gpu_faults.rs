@@ -23,12 +23,12 @@ fn message(result: splat_render::Result<()>) -> String {
 
 #[test]
 fn a_sound_device_passes() {
-    let gpu = gpu();
+    let whole = gpu();
     let began = std::time::Instant::now();
-    gpu.compile_all().unwrap_or_else(|e| panic!("{e}"));
+    whole.compile_all().unwrap_or_else(|e| panic!("{e}"));
     println!("kernels compiled in {:?}", began.elapsed());
     let began = std::time::Instant::now();
-    self_test(&Arc::new(gpu)).unwrap_or_else(|e| panic!("{e}"));
+    self_test(&Arc::new(whole)).unwrap_or_else(|e| panic!("{e}"));
     println!("self-test in {:?}", began.elapsed());
     let plain = gpu().without_subgroups();
     self_test(&Arc::new(plain)).unwrap_or_else(|e| panic!("{e}"));
@@ -84,13 +84,17 @@ impl Fit {
         let mut device = GpuFit::new(Arc::clone(gpu));
         let photo = Target::new(128, 96, 3, vec![90; 3 * 128 * 96]);
         device.set_targets(vec![photo]).unwrap();
-        let mut fit = Self { device, camera };
-        fit.upload(FitState::new(scene.arrays())).unwrap();
-        fit
+        device.upload(FitState::new(scene.arrays())).unwrap();
+        Self { device, camera }
     }
 
-    fn upload(&mut self, state: FitState) -> splat_render::Result<()> {
-        self.device.upload(state)
+    /// Makes the splats as wide as the picture: the pairs of those before the camera outgrow the first
+    /// guess of four per splat.
+    fn make_wide(&mut self) {
+        let mut state = self.device.download().unwrap();
+        state.splats.scales.fill([3.0; 3]);
+        state.splats.opacities.fill(0.0);
+        self.device.upload(state).unwrap();
     }
 
     fn step(&mut self, step: u32) -> splat_render::Result<()> {
@@ -108,12 +112,12 @@ impl Fit {
 
 #[test]
 fn a_lost_device_is_one_message_and_the_next_device_works() {
-    let gpu = Arc::new(gpu());
-    let mut fit = Fit::new(&gpu, 100);
+    let lost = Arc::new(gpu());
+    let mut fit = Fit::new(&lost, 100);
     (1..20).for_each(|step| fit.step(step).unwrap());
-    assert!(!gpu.is_lost());
-    gpu.lose();
-    assert!(gpu.is_lost());
+    assert!(!lost.is_lost());
+    lost.lose();
+    assert!(lost.is_lost());
     let found = message((20..60).try_for_each(|step| fit.step(step)));
     assert!(
         found.contains("was lost") && found.contains("the next call opens it again"),
@@ -132,12 +136,8 @@ fn a_lost_device_is_one_message_and_the_next_device_works() {
 fn growth_beyond_the_memory_is_one_message() {
     let injected = Injected { buffer_bytes: Some(600_000), ..Injected::default() };
     let gpu = Arc::new(faulty(&injected));
-    // Splats as wide as the picture: the pairs of those before the camera outgrow the first guess of four per splat.
     let mut fit = Fit::new(&gpu, 3000);
-    let mut state = fit.device.download().unwrap();
-    state.splats.scales.iter_mut().for_each(|scale| *scale = [3.0; 3]);
-    state.splats.opacities.fill(0.0);
-    fit.upload(state).unwrap();
+    fit.make_wide();
     let found = message((1..40).try_for_each(|step| fit.step(step)));
     assert!(found.contains("is out of memory; use fewer splats or smaller images"), "{found}");
     // The steps that were not done are not forgotten: asking for their result is the same error.
@@ -156,7 +156,7 @@ fn density_control_beyond_the_memory_is_one_message_and_keeps_the_splats() {
     (1..20).for_each(|step| fit.step(step).unwrap());
     let mut before = fit.device.download().unwrap();
     before.stats.grad_sum.fill(1.0);
-    fit.upload(before.clone()).unwrap();
+    fit.device.upload(before.clone()).unwrap();
     let run = McmcRun { cameras: vec![fit.camera], target: 200_000, seed: 1 };
     let mut original = OriginalRun { max_splats: 4000, extent: 1.0, prune_huge: false, seed: 1 };
     for result in [fit.device.mcmc(&run), fit.device.original(&original)] {
@@ -177,13 +177,10 @@ fn density_control_beyond_the_memory_is_one_message_and_keeps_the_splats() {
 #[test]
 fn a_submission_that_fails_loses_no_step_and_repeats_none() {
     let gpu = Arc::new(gpu());
-    // Splats as wide as the picture: their pairs outgrow the first guess, and steps are done again.
+    // Steps whose pairs find no room are done again.
     let end = |failing: u64| {
         let mut fit = Fit::new(&gpu, 200);
-        let mut state = fit.device.download().unwrap();
-        state.splats.scales.iter_mut().for_each(|scale| *scale = [3.0; 3]);
-        state.splats.opacities.fill(0.0);
-        fit.upload(state).unwrap();
+        fit.make_wide();
         gpu.fail_submission(failing);
         let mut failures = 0;
         for step in 1..=4 {

@@ -4,30 +4,18 @@
 mod common;
 
 use std::ops::Range;
-use std::sync::OnceLock;
+use std::sync::LazyLock;
 
 use common::conformance::Bounds;
 use common::*;
 use splat_render::gpu::{Gpu, ResidentPicture, ResidentSplats, ResidentView};
 use splat_render::{Camera, ProjectOptions};
 
-/// One device for all tests, because software adapters compile kernels for seconds.
-fn whole() -> &'static Gpu {
-    static GPU: OnceLock<Gpu> = OnceLock::new();
-    GPU.get_or_init(gpu)
-}
-
-/// With the kernels for discrete GPUs: other tiles, the sort by eight bits, the loss by tiles.
-fn discrete() -> &'static Gpu {
-    static GPU: OnceLock<Gpu> = OnceLock::new();
-    GPU.get_or_init(|| gpu().as_discrete())
-}
-
-/// Without subgroups, which few software drivers have.
-fn plain() -> &'static Gpu {
-    static GPU: OnceLock<Gpu> = OnceLock::new();
-    GPU.get_or_init(|| gpu().without_subgroups())
-}
+/// Devices for all tests, because software adapters compile kernels for seconds: as it is; without
+/// subgroups, which few software drivers have; and with the kernels for discrete GPUs, which have other
+/// tiles, the sort by eight bits and the loss by tiles.
+static GPUS: LazyLock<[Gpu; 3]> =
+    LazyLock::new(|| [gpu(), gpu().without_subgroups(), gpu().as_discrete()]);
 
 const BOUNDS: Bounds = Bounds { picture: 2e-5, gradient: 1e-3 };
 
@@ -40,7 +28,7 @@ fn parts_of_the_work_give_the_same_bits() {
     // As text, because 0 equals -0.
     let run = |gpu: &Gpu| format!("{:?}", pass(gpu, &scene, &camera, &options, None));
     // The picture's own minimum; it holds the colors of 704 splats and the gradient slots of 4 500 pairs.
-    let all = run(whole());
+    let all = run(&GPUS[0]);
     let parts = run(&gpu().with_binding_limit(216_000));
     assert!(all == parts, "a lower binding limit changed the result");
     // 60 tiles and 3 000 splats at 64 per workgroup: the last row of a dispatch is ragged.
@@ -80,7 +68,7 @@ fn resident_pictures_are_those_of_the_stages() {
     let scene = random_scene(&mut rng, 3000, Some(2));
     let cameras = [(150, 90), (64, 48), (131, 77)].map(|(w, h)| random_camera(&mut rng, w, h));
     let large = random_camera(&mut rng, 151, 90);
-    for gpu in [whole(), plain(), discrete()] {
+    for gpu in GPUS.iter() {
         let splats = ResidentSplats::new(gpu, &scene.params()).unwrap();
         let mut picture = ResidentPicture::new(gpu, 150, 90).unwrap();
         let mut draw = |camera: &Camera, columns: Range<u32>| {
@@ -121,7 +109,7 @@ fn resident_pictures_whose_pairs_do_not_fit_are_made_in_parts() {
     let splats = ResidentSplats::new(&limited, &scene.params()).unwrap();
     let mut picture = ResidentPicture::new(&limited, 64, 64).unwrap();
     let drawn = resident_picture(&limited, &mut picture, &splats, &camera, 0..64).unwrap();
-    assert!(drawn == picture_by_stages(whole(), &scene, &camera), "parts changed the picture");
+    assert!(drawn == picture_by_stages(&GPUS[0], &scene, &camera), "parts changed the picture");
 }
 
 #[test]
@@ -132,10 +120,10 @@ fn software_adapters_are_used_only_when_allowed() {
     }
 }
 
-checks_of_all! { [whole()]; 200, 40 }
+checks_of_all! { [&GPUS[0]]; 200, 40 }
 
 checks! {
-    [whole()];
+    [&GPUS[0]];
     conformance::projecting_matches_the_reference(BOUNDS);
     conformance::rendering_matches_the_reference(BOUNDS);
     hard_cases::hard_scenes_agree_with_the_reference(BOUNDS);
@@ -144,7 +132,7 @@ checks! {
 }
 
 checks! {
-    [whole(), plain(), discrete()];
+    GPUS.iter();
     conformance::rasterizing_matches_the_reference(BOUNDS);
     hard_cases::hard_splats_2d_agree_with_the_reference(BOUNDS);
     hard_cases::many_splats_in_one_tile_and_one_on_many(BOUNDS);
@@ -153,6 +141,6 @@ checks! {
 }
 
 checks! {
-    [whole(), discrete()];
+    [&GPUS[0], &GPUS[2]];
     optimization::loss_matches_the_reference();
 }

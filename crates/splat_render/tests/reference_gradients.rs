@@ -54,14 +54,8 @@ impl Scene {
         // Wide offsets, so that some splats lie beyond the Jacobian's limits.
         let means = (0..n).map(|_| [f(-1.6, 1.6), f(-1.6, 1.6), f(-1.0, 1.5)]).collect();
         let quats = (0..n).map(|_| std::array::from_fn(|_| f(-1.0, 1.0))).collect();
-        let scales = (0..n)
-            .map(|_| {
-                std::array::from_fn(|_| {
-                    let s = f(-2.5, 0.3);
-                    if raw { s } else { s.exp() }
-                })
-            })
-            .collect();
+        let scale = |s: f64| if raw { s } else { s.exp() };
+        let scales = (0..n).map(|_| std::array::from_fn(|_| scale(f(-2.5, 0.3)))).collect();
         // Some saturate the cap.
         let opacities = (0..n).map(|_| if raw { f(-2.0, 7.0) } else { f(0.05, 1.0) }).collect();
         let colors = (0..rows).map(|_| std::array::from_fn(|_| f(-0.7, 0.9))).collect();

@@ -13,18 +13,20 @@ use splat_render::cpu::Cpu;
 use splat_render::io::SplatFile;
 use splat_render::{Camera, Image, ProjectOptions, Stages};
 
-fn drawn(file: &SplatFile, camera: &Camera) -> Image<f32> {
-    drawn_over(file, camera, [0.0; 3])
-}
-
-fn drawn_over(file: &SplatFile, camera: &Camera, background: [f32; 3]) -> Image<f32> {
+fn drawn(file: &SplatFile, camera: &Camera, background: [f32; 3]) -> Image<f32> {
     let params = file.splats.params(4);
     let projected = Cpu.project(&params, camera, &ProjectOptions::default()).expect("project");
     Cpu.rasterize(&projected, background).expect("rasterize")
 }
 
-fn bytes(image: &Image<f32>) -> Vec<u8> {
-    image.color.iter().flatten().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect()
+fn picture(image: &Image<f32>) -> Picture {
+    let byte = |v: &f32| (v.clamp(0.0, 1.0) * 255.0).round() as u8;
+    let size = [image.width as usize, image.height as usize];
+    Picture { size, rgb: image.color.iter().flatten().map(byte).collect() }
+}
+
+fn assert_lit(picture: &Picture) {
+    assert!(picture.rgb.iter().any(|&v| v > 60), "the scene is dark");
 }
 
 #[test]
@@ -33,18 +35,16 @@ fn pictures_are_the_rasterizer_s_on_cpu_and_gpu() {
     let (folder, scene) = saved(&file);
     let out = folder.join("out.png");
     write_cameras(&folder.join("cameras.json"), &[camera()]);
-    let expected = bytes(&drawn(&file, &camera()));
+    let expected = picture(&drawn(&file, &camera(), [0.0; 3]));
     for backend in ["cpu", "gpu"] {
         let mut command = command(&scene, &format!("--camera 0 --backend {backend}"));
         let output = run(command.arg("--screenshot").arg(&out));
         // Mesa's error message on machines without a desktop.
         assert!(!said(&output).contains("XDG_RUNTIME_DIR"), "{}", said(&output));
-        let picture = read_png(&out);
-        assert_eq!(picture.size, [120, 80]);
-        let off = picture.rgb.iter().zip(&expected).map(|(a, b)| a.abs_diff(*b)).max();
-        assert!(off <= Some(1), "{backend} is off by {off:?}");
+        let off = read_png(&out).apart(&expected).0;
+        assert!(off <= 1, "{backend} is off by {off}");
     }
-    assert!(expected.iter().any(|&v| v > 60), "the scene is dark");
+    assert_lit(&expected);
 }
 
 #[test]
@@ -61,7 +61,7 @@ fn exr_holds_color_alpha_and_expected_depth() {
     let channel = |i: usize| -> Vec<f32> {
         image.layer_data.channel_data.list[i].sample_data.values_as_f32().collect()
     };
-    let expected = drawn(&file, &camera());
+    let expected = drawn(&file, &camera(), [0.0; 3]);
     let depth: Vec<f32> = expected
         .depth
         .iter()
@@ -141,7 +141,7 @@ fn a_checkpoint_gives_the_picture_of_its_scene() {
     let draw = |name: &str| draw(&folder.join(name), "--size 80x60").0;
     let scene = draw("a");
     assert!(scene == draw("b"));
-    assert!(scene.rgb.iter().any(|&v| v > 60), "nothing is seen so far from the world's origin");
+    assert_lit(&scene);
 }
 
 #[test]
@@ -170,7 +170,7 @@ fn the_file_that_igsr_writes_gives_its_camera() {
     let from =
         |cameras: &Path| draw(&scene, &format!("--camera 0 --cameras {}", cameras.display()));
     let ((seen, _), (expected, _)) = (from(&written), from(&own));
-    assert!(expected.rgb.iter().any(|&v| v > 60), "the scene is dark");
+    assert_lit(&expected);
     assert!(seen.apart(&expected).0 <= 1, "off by {:?}", seen.apart(&expected));
 }
 
@@ -183,7 +183,7 @@ fn every_format_opens_and_shows_the_scene() {
         draw(&folder.join(name), "--size 120x90").0
     };
     let expected = draw("scene.ply");
-    assert!(expected.rgb.iter().any(|&v| v > 60), "the scene is dark");
+    assert_lit(&expected);
     // Largest mean differences, in 255ths: of .splat, which has no view-dependent color, and of the
     // others, which round.
     let formats = [
@@ -248,14 +248,13 @@ fn the_first_view_of_a_run_s_models_is_the_first_photo_s() {
     let draw = |scene: &str, options: &str| {
         draw(&folder.join(scene), &format!("--size 120x80 {options}")).0
     };
-    let picture = |rgb: Vec<u8>| Picture { size: [120, 80], rgb };
-    let expected = picture(bytes(&drawn_over(&file, &camera(), [1.0, 0.5, 0.25])));
+    let expected = picture(&drawn(&file, &camera(), [1.0, 0.5, 0.25]));
     for scene in scenes.iter().chain(&["out"]) {
         let off = draw(scene, "").apart(&expected).0;
         assert!(off <= 1, "{scene} is off by {off}");
     }
     // Options have priority.
-    let black = picture(bytes(&drawn(&file, &other)));
+    let black = picture(&drawn(&file, &other, [0.0; 3]));
     let off = draw(scenes[1], "--camera 1 --background black").apart(&black).0;
     assert!(off <= 1, "off by {off}");
     assert!(draw(scenes[1], "--fov 120").apart(&expected).0 > 30, "--fov does nothing");

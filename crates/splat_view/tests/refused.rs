@@ -11,7 +11,7 @@ use common::{
 use glam::{DMat4, DVec3};
 
 #[test]
-fn files_that_hold_no_splats_are_refused_in_one_message() {
+fn files_without_valid_splats_are_refused_in_one_message() {
     let folder = Folder::new();
     let header = "ply\nformat binary_little_endian 1.0\nelement vertex 4000000000\n\
                   property float x\nproperty float y\nproperty float z\nend_header\n";
@@ -30,6 +30,13 @@ fn files_that_hold_no_splats_are_refused_in_one_message() {
         assert!(!out.exists(), "{name} left a picture");
         // The same before a window opens.
         refused(&mut command(&scene, ""), &[name, word]);
+    }
+    let mut file = ball(10, 14, [0.5; 3]);
+    for origin in [f64::NAN, f64::INFINITY] {
+        file.origin[1] = origin;
+        let path = folder.join("checkpoint.npz");
+        write_checkpoint(&path, &file);
+        refused(&mut command(&path, "--screenshot x.png"), &["checkpoint.npz", "origin"]);
     }
     refused(&mut command(&folder.join("no.ply"), ""), &["no.ply", "cannot be opened"]);
     refused(&mut command(&Folder::new().0, "--time 1"), &["holds no scene.ply"]);
@@ -58,6 +65,8 @@ fn invalid_arguments_are_refused_in_one_message() {
     }
     refused(&mut command(&scene, "--screenshot a.jpg"), &["--screenshot", ".png or .exr"]);
     refused(command(&scene, "--frames").arg(&out), &["--orbit"]);
+    // Larger than any texture.
+    refused(&mut command(&scene, "--time 1 --size 9000x4"), &["--size", "up to 8192", "9000x4"]);
 }
 
 // Metal and DX12 need no file that could be hidden.
@@ -90,27 +99,7 @@ fn without_a_display_the_error_message_suggests_screenshot() {
 }
 
 #[test]
-fn a_checkpoint_whose_origin_is_not_finite_is_refused() {
-    let folder = Folder::new();
-    let path = folder.join("checkpoint.npz");
-    for origin in [f64::NAN, f64::INFINITY] {
-        let mut file = ball(10, 14, [0.5; 3]);
-        file.origin[1] = origin;
-        write_checkpoint(&path, &file);
-        let mut command = command(&path, "--screenshot x.png --backend cpu");
-        refused(&mut command, &["checkpoint.npz", "origin"]);
-    }
-}
-
-#[test]
-fn frames_larger_than_any_texture_are_refused() {
-    let (_folder, scene) = saved(&ball(10, 17, [0.5; 3]));
-    let mut command = command(&scene, "--time 1 --size 9000x4");
-    refused(&mut command, &["--size", "up to 8192", "9000x4"]);
-}
-
-#[test]
-fn cameras_in_other_formats_are_refused() {
+fn cameras_in_other_formats_and_very_large_files_are_refused() {
     let (folder, scene) = saved(&ball(10, 15, [0.5; 3]));
     let refuse = |cameras: &Path, words: &[&str]| {
         refused(command(&scene, "--screenshot x.png --cameras").arg(cameras), words);
@@ -153,6 +142,10 @@ fn cameras_in_other_formats_are_refused() {
     tilted.viewmat = DMat4::from_scale(DVec3::splat(2.0)) * tilted.viewmat;
     write_cameras(&file, &[tilted]);
     refuse(&file, &["0.png", "rigid"]);
+    std::fs::write(&file, good).expect("cameras");
+    let large = std::fs::File::options().append(true).open(&file).expect("open");
+    large.set_len((64 << 20) + 1).expect("size");
+    refuse(&file, &["cameras.json", "67108865 bytes"]);
 }
 
 #[test]
@@ -210,17 +203,6 @@ fn pipes_and_devices_are_refused_at_once() {
     // Without --cameras, the pipe is skipped.
     let (_, notes) = draw(&scene, "--size 20x20");
     assert!(notes.contains("no cameras are shown"), "{notes}");
-}
-
-#[test]
-fn a_very_large_file_of_cameras_is_refused() {
-    let (folder, scene) = saved(&ball(20, 21, [0.5; 3]));
-    let cameras = folder.join("cameras.json");
-    write_cameras(&cameras, &[camera()]);
-    let file = std::fs::File::options().append(true).open(&cameras).expect("open");
-    file.set_len((64 << 20) + 1).expect("size");
-    let mut command = command(&scene, "--screenshot x.png --cameras");
-    refused(command.arg(&cameras), &["cameras.json", "67108865 bytes"]);
 }
 
 #[test]

@@ -90,15 +90,9 @@ pub fn rendering_matches_the_reference(stages: &dyn Stages<f32>, bounds: Bounds)
 /// Pixels of `band` at which the pictures differ by more than `bound`: at most 0.1 % (or one, for under 1
 /// 000 pixels).
 fn left_out(got: &Image<f32>, expected: &Image<f64>, band: &[bool], bound: f64) -> Vec<bool> {
-    // Depth counts as in image_difference: as a part of the largest.
-    let depth_scale = expected.depth.iter().fold(1.0f64, |scale, d| scale.max(d.abs()));
-    let far = |pixel: usize| {
-        let color = (0..3)
-            .any(|c| (f64::from(got.color[pixel][c]) - expected.color[pixel][c]).abs() > bound);
-        let t = f64::from(got.transmittance[pixel]) - expected.transmittance[pixel];
-        let depth = (f64::from(got.depth[pixel]) - expected.depth[pixel]) / depth_scale;
-        color || t.abs() > bound || depth.abs() > bound
-    };
+    let deepest = deepest(expected);
+    let (got, expected) = (pixels(got, deepest), pixels(expected, deepest));
+    let far = |i: usize| (0..6).any(|k| (got[i][k] - expected[i][k]).abs() > bound);
     let out: Vec<bool> = (0..band.len()).map(|pixel| band[pixel] && far(pixel)).collect();
     let count = out.iter().filter(|&&out| out).count();
     assert!(count <= (out.len() / 1000).max(1), "{count} of {} pixels are left out", out.len());

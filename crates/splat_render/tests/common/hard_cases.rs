@@ -328,20 +328,17 @@ pub fn culled_splats_change_nothing(stages: &dyn Stages<f32>) {
             (few.means[i], few.scales[i], -20.0),
             (few.means[i], [f32::NAN; 3], few.opacities[i]),
         ];
+        let own = (few.means[i], few.scales[i], few.opacities[i]);
         // None, one or several before each.
-        for (mean, scales, opacity) in culled.into_iter().cycle().skip(i).take(i % 7) {
+        let before = culled.into_iter().cycle().skip(i).take(i % 7);
+        for (mean, scales, opacity) in before.chain([own]) {
             many.means.push(mean);
             many.quats.push(few.quats[i]);
             many.scales.push(scales);
             many.opacities.push(opacity);
             many.colors.extend(&few.colors[9 * i..9 * i + 9]);
         }
-        many_from_few.push(many.means.len());
-        many.means.push(few.means[i]);
-        many.quats.push(few.quats[i]);
-        many.scales.push(few.scales[i]);
-        many.opacities.push(few.opacities[i]);
-        many.colors.extend(&few.colors[9 * i..9 * i + 9]);
+        many_from_few.push(many.means.len() - 1);
     }
     for options in OPTIONS {
         let [one, other] = [&few, &many].map(|scene| pass(stages, scene, &camera, &options, None));

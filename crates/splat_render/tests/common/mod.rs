@@ -52,7 +52,7 @@ use glam::{DMat3, DMat4, DQuat, DVec3};
 use rand::{Rng, SeedableRng};
 use rand_pcg::Pcg64;
 use splat_render::constants::BLUR;
-use splat_render::fit::Rates;
+use splat_render::fit::{Rates, Target};
 use splat_render::gpu::Gpu;
 use splat_render::splats::SplatArrays;
 use splat_render::stages::{Colors, Float, Image, ImageGradients, Projected, ProjectedGradients};
@@ -126,6 +126,20 @@ impl Scene<f32> {
             sh_degree: self.sh_degree,
         }
     }
+}
+
+/// The photo that shows a picture on black, with or without alpha.
+pub fn photo<T: Copy + Into<f64>>(image: &Image<T>, has_alpha: bool) -> Target {
+    let byte = |v: f64| (v.clamp(0.0, 1.0) * 255.0).round() as u8;
+    let pixel = |(color, &alpha): (&[T; 3], &T)| {
+        let alpha: f64 = alpha.into();
+        let over = if has_alpha { alpha.max(1e-6) } else { 1.0 };
+        let mut bytes = color.map(|c| byte(c.into() / over)).to_vec();
+        bytes.extend(has_alpha.then_some(byte(alpha)));
+        bytes
+    };
+    let bytes = image.color.iter().zip(&image.alpha).flat_map(pixel).collect();
+    Target::new(image.width, image.height, if has_alpha { 4 } else { 3 }, bytes)
 }
 
 /// The picture of splats.
@@ -346,23 +360,11 @@ impl Difference {
     pub fn relative(&self) -> f64 {
         if self.max == 0.0 { 0.0 } else { self.max / self.scale }
     }
-
-    /// Of both.
-    pub fn join(self, other: Self) -> Self {
-        let count = self.count + other.count;
-        let total = self.mean * self.count as f64 + other.mean * other.count as f64;
-        Self {
-            max: self.max.max(other.max),
-            mean: if count == 0 { 0.0 } else { total / count as f64 },
-            scale: self.scale.max(other.scale),
-            count,
-        }
-    }
 }
 
 /// Compares rows; rows with `skip` are left out (an empty `skip` leaves out none).
-pub fn difference<const K: usize>(
-    got: &[[f32; K]],
+pub fn difference<A: Copy + Into<f64>, const K: usize>(
+    got: &[[A; K]],
     expected: &[[f64; K]],
     skip: &[bool],
 ) -> Difference {
@@ -374,7 +376,7 @@ pub fn difference<const K: usize>(
             continue;
         }
         for (g, e) in g.iter().zip(e) {
-            let off = (f64::from(*g) - e).abs();
+            let off = ((*g).into() - e).abs();
             let off = if off.is_nan() { f64::INFINITY } else { off };
             out.max = out.max.max(off);
             out.scale = out.scale.max(e.abs());
@@ -387,22 +389,30 @@ pub fn difference<const K: usize>(
 }
 
 /// [`difference`] of scalars.
-pub fn difference1(got: &[f32], expected: &[f64], skip: &[bool]) -> Difference {
+pub fn difference1<A: Copy + Into<f64>>(got: &[A], expected: &[f64], skip: &[bool]) -> Difference {
     difference(got.as_chunks::<1>().0, expected.as_chunks::<1>().0, skip)
 }
 
-/// Difference of two pictures (color, alpha, transmittance; depth as a part of the largest),
-/// pixels in `band` left out.
+/// Color, alpha, transmittance, and depth as a part of `deepest`, of each pixel.
+pub fn pixels<T: Copy + Into<f64>>(image: &Image<T>, deepest: f64) -> Vec<[f64; 6]> {
+    let pixel = |i: usize| {
+        let [r, g, b] = image.color[i].map(T::into);
+        let [alpha, depth] = [image.alpha[i], image.depth[i]].map(T::into);
+        [r, g, b, alpha, image.transmittance[i].into(), depth / deepest]
+    };
+    (0..image.alpha.len()).map(pixel).collect()
+}
+
+/// The largest depth, at least 1.
+pub fn deepest(image: &Image<f64>) -> f64 {
+    image.depth.iter().fold(1.0, |deepest, depth| depth.abs().max(deepest))
+}
+
+/// Difference of two pictures, pixels in `band` left out.
 pub fn image_difference(got: &Image<f32>, expected: &Image<f64>, band: &[bool]) -> Difference {
     assert_eq!((got.width, got.height), (expected.width, expected.height));
-    let mut depth = difference1(&got.depth, &expected.depth, band);
-    let scale = depth.scale.max(1.0);
-    depth.max /= scale;
-    depth.mean /= scale;
-    difference(&got.color, &expected.color, band)
-        .join(difference1(&got.alpha, &expected.alpha, band))
-        .join(difference1(&got.transmittance, &expected.transmittance, band))
-        .join(depth)
+    let deepest = deepest(expected);
+    difference(&pixels(got, deepest), &pixels(expected, deepest), band)
 }
 
 /// Gradients of the 2D splats, kind by kind.
@@ -433,10 +443,6 @@ pub fn splat_gradient_differences(
     got: &SplatGradients<f32>,
     expected: &SplatGradients<f64>,
 ) -> Vec<(&'static str, Difference)> {
-    let camera = |g: &[f64], e: &[f64]| {
-        let got: Vec<f32> = g.iter().map(|&v| v as f32).collect();
-        difference1(&got, e, &[])
-    };
     let focal = (&got.v_intrinsics[..2], &expected.v_intrinsics[..2]);
     let center = (&got.v_intrinsics[2..], &expected.v_intrinsics[2..]);
     vec![
@@ -445,9 +451,12 @@ pub fn splat_gradient_differences(
         ("v_scales", difference(&got.v_scales, &expected.v_scales, &[])),
         ("v_opacities", difference1(&got.v_opacities, &expected.v_opacities, &[])),
         ("v_colors", difference(&got.v_colors, &expected.v_colors, &[])),
-        ("v_viewmat", camera(got.v_viewmat.as_flattened(), expected.v_viewmat.as_flattened())),
-        ("v_fx_fy", camera(focal.0, focal.1)),
-        ("v_cx_cy", camera(center.0, center.1)),
+        (
+            "v_viewmat",
+            difference1(got.v_viewmat.as_flattened(), expected.v_viewmat.as_flattened(), &[]),
+        ),
+        ("v_fx_fy", difference1(focal.0, focal.1, &[])),
+        ("v_cx_cy", difference1(center.0, center.1, &[])),
     ]
 }
 

@@ -223,13 +223,13 @@ pub fn full_step(sh_degree: u32) -> AdamStep {
     }
 }
 
-fn differences(got: &SplatArrays, expected: &SplatArrays<f64>) -> [Difference; 5] {
+fn differences(got: &SplatArrays, expected: &SplatArrays<f64>) -> [(&'static str, Difference); 5] {
     [
-        difference(&got.means, &expected.means, &[]),
-        difference(&got.quats, &expected.quats, &[]),
-        difference(&got.scales, &expected.scales, &[]),
-        difference1(&got.opacities, &expected.opacities, &[]),
-        difference(&got.sh, &expected.sh, &[]),
+        ("means", difference(&got.means, &expected.means, &[])),
+        ("quats", difference(&got.quats, &expected.quats, &[])),
+        ("scales", difference(&got.scales, &expected.scales, &[])),
+        ("opacities", difference1(&got.opacities, &expected.opacities, &[])),
+        ("sh", difference(&got.sh, &expected.sh, &[])),
     ]
 }
 
@@ -255,10 +255,7 @@ pub fn adam_matches_the_reference(stages: &dyn Stages<f32>) {
             ("first moments", &state.first, &expected.first),
             ("second moments", &state.second, &expected.second),
         ] {
-            for (kind, off) in ["means", "quats", "scales", "opacities", "sh"]
-                .iter()
-                .zip(differences(got, expected))
-            {
+            for (kind, off) in differences(got, expected) {
                 let off = off.relative();
                 println!("{n} splats, SH {used} of {stored}: {what}, {kind} {off:.1e}");
                 assert!(off <= ADAM, "{n} splats, SH {used} of {stored}: {what}, {kind} {off:.1e}");

@@ -3,6 +3,8 @@
 use std::io::{Cursor, Read, Write};
 use std::path::Path;
 
+use flate2::Compression;
+use flate2::write::GzEncoder;
 use glam::{DQuat, DVec3};
 use half::f16;
 use ruzstd::encoding::{CompressionLevel, compress_to_vec};
@@ -206,13 +208,14 @@ pub fn spz_4(splats: &SplatArrays) -> Vec<u8> {
     out
 }
 
+pub fn gzip(bytes: &[u8]) -> Vec<u8> {
+    let mut gzip = GzEncoder::new(Vec::new(), Compression::fast());
+    gzip.write_all(bytes).unwrap();
+    gzip.finish().unwrap()
+}
+
 #[test]
 fn spz_of_every_version() {
-    let gzip = |bytes: &[u8]| {
-        let mut gzip = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::default());
-        gzip.write_all(bytes).unwrap();
-        gzip.finish().unwrap()
-    };
     for degree in 0..=3 {
         let file = scene(50, degree);
         let two = spz_2(&file.splats);

@@ -181,7 +181,7 @@ fn writing_stops_on_request() {
     write_splats(&folder.join("scene.ply"), &field()).expect("a scene");
     // While cells are found, while they are filled, before the first is merged, and after some.
     for asked in [0, 1, 2, 3] {
-        let out = folder.join(&format!("out{asked}"));
+        let out = folder.join(format!("out{asked}"));
         std::fs::create_dir(&out).expect("a folder");
         let mut left = asked;
         let mut goes_on = || {

@@ -17,7 +17,8 @@ pub fn breaches(module: &Module, info: &ModuleInfo) -> Vec<String> {
     for (index, entry) in module.entry_points.iter().enumerate() {
         let of = info.get_entry_point(index);
         let name = entry.name.clone();
-        Walk { module, function: &entry.function, of, name, found: &mut found }.all(false);
+        let function = &entry.function;
+        Walk { module, function, of, name, found: &mut found }.all(false);
     }
     found
 }
@@ -31,7 +32,6 @@ struct Walk<'a> {
 }
 
 impl Walk<'_> {
-    /// `is_called`: whether the function is inlined into another.
     fn all(&mut self, is_called: bool) {
         self.block(&self.function.body, false, false, is_called);
     }
@@ -40,6 +40,7 @@ impl Walk<'_> {
         self.found.push(format!("{}: {what}", self.name));
     }
 
+    /// `is_called`: whether the function is inlined into another.
     fn block(&mut self, block: &Block, in_loop: bool, in_switch: bool, is_called: bool) {
         for statement in block {
             match statement {
@@ -68,7 +69,9 @@ impl Walk<'_> {
                 Statement::Store { pointer, .. } => self.store(*pointer),
                 Statement::Emit(range) if in_loop => {
                     for expression in range.clone() {
-                        self.gradient(expression);
+                        if takes_gradient(&self.function.expressions[expression]) {
+                            self.report("a gradient in a loop");
+                        }
                     }
                 }
                 Statement::Call { function, .. } if in_loop => {
@@ -78,12 +81,6 @@ impl Walk<'_> {
                 }
                 _ => {}
             }
-        }
-    }
-
-    fn gradient(&mut self, expression: Handle<Expression>) {
-        if takes_gradient(&self.function.expressions[expression]) {
-            self.report("a gradient in a loop");
         }
     }
 
@@ -101,18 +98,14 @@ impl Walk<'_> {
                 Expression::AccessIndex { base, .. } => base,
                 Expression::GlobalVariable(variable) => {
                     let space = self.module.global_variables[variable].space;
-                    if picks && !matches!(space, AddressSpace::Storage { .. }) {
-                        self.report("a store to a component that is picked at run time");
-                    }
-                    return;
+                    picks &= !matches!(space, AddressSpace::Storage { .. });
+                    break;
                 }
-                _ => {
-                    if picks {
-                        self.report("a store to a component that is picked at run time");
-                    }
-                    return;
-                }
+                _ => break,
             };
+        }
+        if picks {
+            self.report("a store to a component that is picked at run time");
         }
     }
 

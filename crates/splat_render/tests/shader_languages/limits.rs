@@ -1,78 +1,74 @@
 //! The shaders' requirements, from naga's IR: within WebGPU's default limits, which every conformant
 //! adapter has.
 
+use std::collections::BTreeMap;
+
 use naga::proc::Layouter;
 use naga::{AddressSpace, Binding, ImageClass, TypeInner};
-
 use splat_render::gpu::needed_limits;
 
 use super::{Compiled, compiled};
 
-struct Use {
-    storage_buffers: u32,
-    uniform_buffers: u32,
-    textures: u32,
-    samplers: u32,
-    workgroup_bytes: u32,
-    largest_uniform: u32,
-    largest_storage: u32,
-    highest_group: u32,
-    highest_binding: u32,
-}
-
-/// Of one entry point; globals that it does not touch do not count.
-fn used(shader: &Compiled) -> Use {
+/// What one entry point uses: numbers by name. Globals that it does not touch do not count.
+fn used(shader: &Compiled) -> BTreeMap<&'static str, u32> {
     let mut layouter = Layouter::default();
     layouter.update(shader.module.to_ctx()).expect("layout");
-    let mut out = Use {
-        storage_buffers: 0,
-        uniform_buffers: 0,
-        textures: 0,
-        samplers: 0,
-        workgroup_bytes: 0,
-        largest_uniform: 0,
-        largest_storage: 0,
-        highest_group: 0,
-        highest_binding: 0,
-    };
-    let index = shader
-        .module
-        .entry_points
-        .iter()
-        .position(|e| e.name == shader.entry && e.stage == shader.stage)
+    let mut uses = BTreeMap::new();
+    let mut entries = shader.module.entry_points.iter().enumerate();
+    let (index, entry) = entries
+        .find(|(_, e)| e.name == shader.entry && e.stage == shader.stage)
         .expect("the entry point");
     let info = shader.info.get_entry_point(index);
+    let mut raise = |what, by: u32, most: u32| {
+        let value = uses.entry(what).or_insert(0);
+        *value = (*value + by).max(most);
+    };
     for (handle, variable) in shader.module.global_variables.iter() {
         if info[handle].is_empty() {
             continue;
         }
         if let Some(binding) = &variable.binding {
-            out.highest_group = out.highest_group.max(binding.group);
-            out.highest_binding = out.highest_binding.max(binding.binding);
+            raise("groups", 0, binding.group + 1);
+            raise("bindings", 0, binding.binding + 1);
         }
         let bytes = layouter[variable.ty].size;
         match variable.space {
             AddressSpace::Storage { .. } => {
-                out.storage_buffers += 1;
-                out.largest_storage = out.largest_storage.max(bytes);
+                raise("storage buffers", 1, 0);
+                raise("bytes of fixed storage", 0, bytes);
             }
             AddressSpace::Uniform => {
-                out.uniform_buffers += 1;
-                out.largest_uniform = out.largest_uniform.max(bytes);
+                raise("uniform buffers", 1, 0);
+                raise("bytes of a uniform", 0, bytes);
             }
             // As naga lays it out, each variable on a boundary of 16 bytes.
-            AddressSpace::WorkGroup => out.workgroup_bytes += bytes.next_multiple_of(16),
+            AddressSpace::WorkGroup => raise("bytes of workgroup", bytes.next_multiple_of(16), 0),
             _ => match &shader.module.types[variable.ty].inner {
                 TypeInner::Image { class, .. } => {
                     assert!(matches!(class, ImageClass::Sampled { .. }), "{}", shader.name);
-                    out.textures += 1;
+                    raise("textures", 1, 0);
                 }
-                TypeInner::Sampler { .. } => out.samplers += 1,
+                TypeInner::Sampler { .. } => raise("samplers", 1, 0),
                 _ => {}
             },
         }
     }
-    out
+    let [x, y, z] = entry.workgroup_size;
+    raise("invocations", x * y * z, 0);
+    for (side, value) in [("wide", x), ("high", y), ("deep", z)] {
+        raise(side, value, 0);
+    }
+    if let Some(result) = &entry.function.result {
+        let varyings = match &shader.module.types[result.ty].inner {
+            TypeInner::Struct { members, .. } => members
+                .iter()
+                .filter(|m| matches!(m.binding, Some(Binding::Location { .. })))
+                .count() as u32,
+            _ => 1,
+        };
+        raise("varyings", varyings, 0);
+    }
+    uses
 }
 
 #[test]
@@ -85,54 +81,28 @@ fn shaders_ask_for_no_more_than_the_default_limits() {
     assert!(limits.max_storage_buffer_binding_size <= 128 << 20);
     assert!(needed_limits().check_limits(&limits));
     // The kernels' needs equal the limits for refusal; the viewer requests its textures itself.
-    let limits = needed_limits();
-    let textures = wgpu::Limits::default();
+    let (limits, viewer) = (needed_limits(), limits);
+    let bytes = |limit: u64| u32::try_from(limit).expect("a u32");
+    let most = BTreeMap::from([
+        ("storage buffers", limits.max_storage_buffers_per_shader_stage),
+        ("uniform buffers", limits.max_uniform_buffers_per_shader_stage),
+        ("textures", viewer.max_sampled_textures_per_shader_stage),
+        ("samplers", viewer.max_samplers_per_shader_stage),
+        ("bytes of workgroup", limits.max_compute_workgroup_storage_size),
+        ("bytes of a uniform", bytes(limits.max_uniform_buffer_binding_size)),
+        ("bytes of fixed storage", bytes(limits.max_storage_buffer_binding_size)),
+        ("groups", limits.max_bind_groups),
+        ("bindings", limits.max_bindings_per_bind_group),
+        ("invocations", limits.max_compute_invocations_per_workgroup),
+        ("wide", limits.max_compute_workgroup_size_x),
+        ("high", limits.max_compute_workgroup_size_y),
+        ("deep", limits.max_compute_workgroup_size_z),
+        ("varyings", viewer.max_inter_stage_shader_variables),
+    ]);
     for shader in compiled() {
-        let name = &shader.name;
-        let uses = used(&shader);
-        let at_most = |what: &str, value: u32, limit: u32| {
-            assert!(value <= limit, "{name}: {value} {what}, the limit is {limit}");
-        };
-        let bindings = u32::try_from(limits.max_storage_buffer_binding_size).expect("a u32");
-        let uniform = u32::try_from(limits.max_uniform_buffer_binding_size).expect("a u32");
-        at_most(
-            "storage buffers",
-            uses.storage_buffers,
-            limits.max_storage_buffers_per_shader_stage,
-        );
-        at_most(
-            "uniform buffers",
-            uses.uniform_buffers,
-            limits.max_uniform_buffers_per_shader_stage,
-        );
-        at_most("textures", uses.textures, textures.max_sampled_textures_per_shader_stage);
-        at_most("samplers", uses.samplers, textures.max_samplers_per_shader_stage);
-        at_most(
-            "bytes of workgroup",
-            uses.workgroup_bytes,
-            limits.max_compute_workgroup_storage_size,
-        );
-        at_most("bytes of a uniform", uses.largest_uniform, uniform);
-        at_most("bytes of fixed storage", uses.largest_storage, bindings);
-        at_most("as a group", uses.highest_group + 1, limits.max_bind_groups);
-        at_most("as a binding", uses.highest_binding + 1, limits.max_bindings_per_bind_group);
-
-        let entry = shader.module.entry_points.iter().find(|e| e.name == shader.entry);
-        let entry = entry.expect("the entry point");
-        let [x, y, z] = entry.workgroup_size;
-        at_most("invocations", x * y * z, limits.max_compute_invocations_per_workgroup);
-        at_most("wide", x, limits.max_compute_workgroup_size_x);
-        at_most("high", y, limits.max_compute_workgroup_size_y);
-        at_most("deep", z, limits.max_compute_workgroup_size_z);
-        let varyings = entry.function.result.iter().map(|result| {
-            match &shader.module.types[result.ty].inner {
-                TypeInner::Struct { members, .. } => members
-                    .iter()
-                    .filter(|m| matches!(m.binding, Some(Binding::Location { .. })))
-                    .count() as u32,
-                _ => 1,
-            }
-        });
-        at_most("varyings", varyings.sum(), textures.max_inter_stage_shader_variables);
+        for (what, value) in used(&shader) {
+            let limit = most[what];
+            assert!(value <= limit, "{}: {value} {what}, the limit is {limit}", shader.name);
+        }
     }
 }

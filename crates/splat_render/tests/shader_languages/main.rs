@@ -118,9 +118,7 @@ fn hlsl(shader: &Compiled, shader_model: hlsl::ShaderModel) -> String {
     let written = hlsl::Writer::new(&mut text, &options, &entry)
         .write(&shader.module, &shader.info, None)
         .unwrap_or_else(|e| panic!("{}: {e}", shader.name));
-    for name in written.entry_point_names {
-        name.unwrap_or_else(|e| panic!("{}: {e}", shader.name));
-    }
+    assert!(written.entry_point_names.iter().all(Result::is_ok), "{}", shader.name);
     text
 }
 
@@ -137,9 +135,7 @@ fn msl(shader: &Compiled) -> String {
     };
     let (text, written) = msl::write_string(&shader.module, &shader.info, &options, &entry)
         .unwrap_or_else(|e| panic!("{}: {e}", shader.name));
-    for name in written.entry_point_names {
-        name.unwrap_or_else(|e| panic!("{}: {e}", shader.name));
-    }
+    assert!(written.entry_point_names.iter().all(Result::is_ok), "{}", shader.name);
     text
 }
 
