@@ -1,6 +1,6 @@
 """Difix as igsr's denoiser: renders are cleaned by a single-step diffusion model and a photo.
 
-Difix (Wu et al., "Difix3D+", CVPR 2025) is NVIDIA's, with a licence of its own; read it first. It
+Difix (Wu et al., "Difix3D+", CVPR 2025) is NVIDIA's; read its license first. It
 needs a GPU with 8 GB, ``pip install diffusers transformers accelerate``, and a clone of its
 repository, whose ``src`` holds ``pipeline_difix.py``:
 
@@ -30,7 +30,7 @@ def make() -> SingleStepDenoiser:
     pipeline.set_progress_bar_config(disable=True)
 
     def clean(render: Tensor, photo: Tensor | None) -> Tensor:
-        # The model was trained with a photo beside each render.
+        # The model was trained with a photo for each render.
         made = pipeline(
             "remove degradation",
             image=render,

@@ -2,14 +2,14 @@
 
     make example-capture
 
-or, where igsr and ``examples/requirements.txt`` are installed,
+or, with igsr and ``examples/requirements.txt`` installed,
 
     python examples/make_capture.py --out examples/tea_table
 
 Everything in the scene is made here: the meshes and textures with numpy, the light and the photos
 with Mitsuba 3 (``scalar_rgb``, which needs no driver). The capture is in the NeRF-Synthetic layout:
 ``transforms_train.json`` and ``transforms_test.json`` (``camera_angle_x``, camera-to-world matrices
-in OpenGL axes, ``file_path`` without ``.png``) beside 8-bit sRGB PNGs with straight alpha.
+in OpenGL axes, ``file_path`` without ``.png``) with 8-bit sRGB PNGs with straight alpha.
 
 The same seed gives the same files. Before any photo is taken, the cameras are checked: small lamps
 at known places are rendered through them and must appear where the written matrices project them.
@@ -98,7 +98,7 @@ def take_photo(scene: mi.Scene, matrix: np.ndarray, samples: int, seed: int) -> 
 
 
 def check_cameras(cameras: list[np.ndarray], tolerance: float = 0.05) -> float:
-    """Renders lamps at known places; returns the largest error in pixels of where they appear."""
+    """Renders lamps at known places; returns the largest error of their positions, pixels."""
     lamps = TARGET + np.array([[0.8, 0, 0], [0, 0.7, 0.2], [-0.6, -0.5, 0], [0.1, 0.2, 0.6]])
     worst = camera_error([viewpoint(matrix) for matrix in cameras], lamps, radius=0.03)
     if worst > tolerance:
@@ -336,7 +336,7 @@ def build_scene() -> mi.Scene:
     ear = np.stack([0.145 + 0.07 * np.cos(t), 0 * t, 0.125 + 0.05 * np.sin(t)], -1)
     add(place(tube(ear, 0.014, closed=False), cup, -0.9), plain)
 
-    # Two books, one across the other.
+    # Two crossed books.
     inks = [([0.10, 0.30, 0.26], [0.90, 0.78, 0.42]), ([0.52, 0.12, 0.16], [0.93, 0.88, 0.76])]
     places = [
         ((0.02, -0.58, 0.0), 0.35, (0.72, 0.52, 0.11)),
@@ -372,7 +372,7 @@ def build_scene() -> mi.Scene:
 
     scene: Scene = {
         "type": "scene",
-        # Six bounces, and the sky itself is no part of the photo: it stays transparent.
+        # Six bounces; the sky stays transparent.
         "integrator": {"type": "path", "max_depth": 6, "hide_emitters": True},
         "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.52, 0.56, 0.64]}},
         "window": {
@@ -395,7 +395,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "tea_table")
     parser.add_argument("--samples", type=int, default=121, help="light paths per pixel, a square")
-    parser.add_argument("--only", type=int, help="take only the first so many photos of each split")
+    parser.add_argument("--only", type=int, help="maximum number of photos of each split")
     arguments = parser.parse_args()
 
     splits = {"train": train_cameras(np.random.default_rng(SEED)), "test": test_cameras()}

@@ -1,11 +1,11 @@
-"""Fit splats with a loss and an optimiser of one's own.
+"""Fit splats with another loss and optimizer.
 
 `igsr.rasterization` is a differentiable torch function, so a fit is an ordinary training loop:
 
     python examples/own_loss.py [examples/tea_table] [--steps 1000]
 
 The number of splats stays as it is here; gsplat's strategies, which add and remove splats, run on
-`igsr.rasterization` too. `python -m igsr_lab bench` times such a loop beside the built-in fit.
+`igsr.rasterization` too. `python -m igsr_lab bench` times such a loop and the built-in fit.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Independent runs, each kept in a file of its own, so that a study resumes where it stopped."""
+"""Independent runs, each with its own file, so that a study can be resumed."""
 
 from __future__ import annotations
 

@@ -235,7 +235,7 @@ fn halves_of_splats_with_extreme_numbers_are_the_host_s() {
     let before: HashSet<_> = state.splats.means.iter().map(|m| m.map(f32::to_bits)).collect();
     let still = after.splats.means.iter().filter(|m| before.contains(&m.map(f32::to_bits)));
     let still = still.count();
-    assert!(still > n / 10 && still < n, "{still} halves lie where their splat lay");
+    assert!(still > n / 10 && still < n, "{still} halves did not move");
 }
 
 /// Splats that end exactly at a picture's edge: rounding decides which are fog.

@@ -292,8 +292,8 @@ mod tests {
         let (from, to) = (seen(&turned, turned.pivot()), seen(&panned, turned.pivot()));
         assert!((to[0] - from[0] - 50.0).abs() < 1.0, "{from:?} {to:?}");
         assert!((to[1] - from[1] - 30.0).abs() < 1.0, "{from:?} {to:?}");
-        assert!((panned.distance / turned.distance - 1.0).abs() < 1e-6, "a pan is no zoom");
-        assert!(panned.forward().distance(turned.forward()) < 1e-9, "a pan is no turn");
+        assert!((panned.distance / turned.distance - 1.0).abs() < 1e-6, "a pan does not zoom");
+        assert!(panned.forward().distance(turned.forward()) < 1e-9, "a pan does not rotate");
     }
 
     #[test]

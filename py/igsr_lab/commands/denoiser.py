@@ -148,7 +148,7 @@ def train_command(
         Literal["alex", "vgg", "squeeze"] | None,
         option("--lpips", help="LPIPS with this backbone, which is downloaded."),
     ] = None,
-    # Not --start, which torchrun would read as the beginning of one of its own options.
+    # Not --start: torchrun has options that begin with it.
     start: Annotated[
         Path | None,
         option("--weights", metavar="FILE", help="Initial weights, such as igsr's own."),

@@ -53,10 +53,10 @@ GRAY = (0.5, 0.5, 0.5)
 
 @dataclasses.dataclass
 class Inputs:
-    """What all parts of the run work on.
+    """Shared by all parts of the run.
 
     Attributes:
-        folder: for what is written.
+        folder: for output.
         ball: splats that the photos of ``around`` show.
         around: capture of photos with alpha, in the folder ``around``.
         room: capture of photos without alpha, with points and tracks, in the folder ``room``.
@@ -150,7 +150,7 @@ def fits(inputs: Inputs) -> Results:
 
 
 def fitted(capture: igsr.Capture, *arguments: Any, **options: Any) -> list[Any]:
-    """The splats of a fit, and the last loss that it tells."""
+    """The splats of a fit and its last loss."""
     options = {"backend": "cpu", **options}
     result = igsr.fit(capture, *arguments, **options)
     return [result.splats, result.loss]
@@ -224,7 +224,7 @@ def poses(inputs: Inputs) -> Results:
 
 
 def resumed(inputs: Inputs) -> Results:
-    """Fits that were stopped and went on from their checkpoint, beside those that were not."""
+    """Fits that were stopped and resumed, and uninterrupted fits."""
     for backend in inputs.fitting:
         for name, capture, options in (
             ("fixed poses", inputs.around, {"steps": 500, "density": "mcmc"}),
@@ -294,7 +294,7 @@ def inverted(render: Any, photos: Sequence[Any]) -> tuple[np.ndarray, np.ndarray
 
 
 def refinement_files(out: Path) -> Results:
-    """What a refinement wrote: models, novel views, cameras and the report's numbers."""
+    """Files of a refinement: models, novel views, cameras and the report's numbers."""
     yield "scene.ply", out / "scene.ply"
     for folder in sorted((out / "rounds").iterdir()):
         if (folder / "scene.ply").is_file():
@@ -310,7 +310,7 @@ def refinement_files(out: Path) -> Results:
 
 
 def commands(inputs: Inputs) -> Results:
-    """The command line: what it writes and the numbers that it reports."""
+    """The command line: its files and the numbers that it reports."""
     out = inputs.folder / "cli"
     around, room = inputs.folder / "around", inputs.folder / "room"
     run("fit", around, "--out", out / "fit", "--steps", 400, "--max-splats", 800, "--seed", 7)
@@ -332,7 +332,7 @@ def commands(inputs: Inputs) -> Results:
 
 
 def fit_files(out: Path) -> Results:
-    """What a fit wrote: the model, the contact sheet, cameras and the report's numbers."""
+    """Files of a fit: the model, the contact sheet, cameras and the report's numbers."""
     yield "scene.ply", out / "scene.ply"
     yield "views.png", pixels(out / "views.png")
     yield from prefixed("cameras", named_numbers(read_json(out / "cameras.json")))
@@ -510,7 +510,7 @@ def plain_photos(inputs: Inputs) -> Results:
 
 
 def denoised(inputs: Inputs) -> Results:
-    """Renders as the denoiser that comes with igsr cleans them, alone and beside photos."""
+    """Renders, cleaned by the denoiser of igsr without and with photos."""
     splats, _ = fit(inputs.around, 200, backend="cpu", max_splats=400, seed=1)
     camera = camera_at(33.0, 4.0, 80, 72)
     found = igsr.render(splats, camera, WHITE, backend="cpu")
@@ -542,7 +542,7 @@ PARTS: dict[str, Callable[[Inputs], Results]] = {
 
 
 def machine() -> dict[str, str | None]:
-    """What the bits depend on beside the code."""
+    """The environment on which the bits depend, apart from the code."""
     found: dict[str, str | None] = {
         "torch": torch.__version__,
         "numpy": np.__version__,
@@ -561,7 +561,7 @@ def machine() -> dict[str, str | None]:
 def all_hashes(parts: Sequence[str], gpu: bool) -> dict[str, str]:
     """The hashes of all results of some parts, by name.
 
-    A part that ends with an error is told on stderr, and its other results are missing.
+    A part that fails is reported on stderr, and its other results are missing.
     """
     hashes: dict[str, str] = {}
     with tempfile.TemporaryDirectory(prefix="same_bits_") as folder:

@@ -191,7 +191,7 @@ def _psnr_and_ssim(
 
 
 def _largest(views: list[View]) -> list[int]:
-    """Width and height of the view with the most pixels."""
+    """Width and height of the largest view."""
     camera = max((view.camera for view in views), key=lambda one: one.width * one.height)
     return [camera.width, camera.height]
 

@@ -76,7 +76,7 @@ class RefinementRun:
 
 @dataclass(frozen=True)
 class RefinementSettings:
-    """What all runs of a study share."""
+    """Shared by all runs of a study."""
 
     out: str  # folder of the study
     methods: tuple[Method, ...]  # continue from each fit

@@ -217,7 +217,7 @@ def _settings(
     steps: int | None = None,
     max_size: int | None = None,
 ) -> RefinementSettings:
-    """Check what all runs share."""
+    """Check the shared settings of the runs."""
     for method in methods:
         if method.method not in METHODS:
             raise IgsrError(f"methods must be of {', '.join(METHODS)}, not {method.method!r}.")

@@ -1,6 +1,6 @@
 //! The SSIM window as two passes of 11 taps, and the memory layout of a picture's rows for them.
 //!
-//! A row is cut into as many equal parts as a vector has lanes; vector k holds the k-th value of each
+//! A row is cut into equal parts, one for each lane of a vector; vector k holds the k-th value of each
 //! part. The neighbors of a vector's values along the row are then in the adjacent vectors, and both
 //! passes read whole, aligned vectors. In row-major layout each tap would read across cache lines. Only
 //! at the ends of parts do values come from the next lane.

@@ -133,7 +133,7 @@ mod tests {
         assert_eq!(fog(&splats, &[CAMERA]), [400, 404]);
         let mut away = CAMERA;
         away.viewmat = glam::DMat4::from_rotation_y(std::f64::consts::PI);
-        assert!(fog(&splats, &[away]).is_empty(), "it shows too little to tell");
+        assert!(fog(&splats, &[away]).is_empty(), "it shows too little");
         assert_eq!(fog(&splats, &[away, CAMERA]), [400, 404]);
     }
 

@@ -69,7 +69,7 @@ mod tests {
         assert_eq!(dropped(3, 0.0).count(), 0);
         for (seed, rate) in [(0, 0.1), (7, 0.3), (u32::MAX, 0.9)] {
             let part = dropped(seed, rate).count() as f32 / 1e5;
-            assert!((part - rate).abs() < 0.01, "{part} where {rate} was asked for");
+            assert!((part - rate).abs() < 0.01, "{part} instead of {rate}");
         }
         // Two steps agree by chance only.
         let both = dropped(1, 0.3).filter(|&i| is_dropped(2, i, 0.3)).count() as f32 / 1e5;

@@ -35,7 +35,7 @@ impl<'a> Bytes<'a> {
         self.left.len()
     }
 
-    /// The next `count` bytes; `what` describes them in errors.
+    /// The next `count` bytes; errors contain their name.
     pub fn take(&mut self, count: usize, what: &str) -> Result<&'a [u8]> {
         let (taken, left) =
             self.left.split_at_checked(count).ok_or_else(|| self.named.ends_within(what))?;

@@ -75,7 +75,7 @@ pub fn counted(count: usize) -> String {
     format!("{count} splat{}", if count == 1 { "" } else { "s" })
 }
 
-/// Notes that `count` values, such as `what`, were beyond a format's range, if any were.
+/// Notes that `count` values were beyond the range of a format, if there were any.
 pub fn say_clipped(notes: &mut Vec<String>, count: usize, what: &str, range: &str) {
     match count {
         0 => {}

@@ -209,7 +209,7 @@ pub fn the_last_splats_stay(device: &mut dyn FitDevice) {
             (&after.first, &all.first, &before.first),
             (&after.second, &all.second, &before.second),
         ] {
-            assert!(after.select(&head) == all.select(&head), "{frozen}: those that move differ");
+            assert!(after.select(&head) == all.select(&head), "{frozen}: the moving splats differ");
             assert!(after.select(&tail) == before.select(&tail), "{frozen}: a frozen one moved");
         }
         assert_eq!(device.loss().unwrap(), loss);

@@ -155,7 +155,7 @@ pub fn thresholds_are_the_same_everywhere(stages: &dyn Stages<f32>) {
     let two = render(&[0.9899, 0.9899]);
     assert!((two.0 - 1.02e-4).abs() < 1e-7 && two.1 > 0.9998, "{two:?}");
     assert_eq!(render(&[0.9899, 0.9899, 0.5]), two, "the third layer is not drawn");
-    assert_eq!(render(&[0.9899, 0.9899, 0.5, min.next_up()]), two, "nor what lies behind it");
+    assert_eq!(render(&[0.9899, 0.9899, 0.5, min.next_up()]), two, "nor splats behind it");
 }
 
 /// Splats on the edges of tiles and of the picture.

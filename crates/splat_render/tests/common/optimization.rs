@@ -62,7 +62,7 @@ pub fn loss_matches_the_reference(stages: &dyn Stages<f32>) {
             let off = (f64::from(got.value) - expected.value).abs();
             let gradient = difference(&got.v_color, &expected.v_color, &[]).relative();
             println!("{what}: loss off by {off:.1e}, gradient by {gradient:.1e} of the largest");
-            assert!(off <= LOSS.0, "{what}: {} where {} is right", got.value, expected.value);
+            assert!(off <= LOSS.0, "{what}: {} instead of {}", got.value, expected.value);
             assert!(gradient <= LOSS.1, "{what}: the gradient is {gradient:.1e} off");
         }
     }
@@ -163,7 +163,7 @@ pub fn depth_loss_matches_the_reference(stages: &dyn Stages<f32>) {
         let of_alpha = difference1(&got.v_alpha, &expected.v_alpha, &[]).relative();
         let of_depth = difference1(&got.v_depth, &expected.v_depth, &[]).relative();
         println!("{size:?}: off by {off:.1e}, gradients by {of_alpha:.1e} and {of_depth:.1e}");
-        assert!(off <= 2e-6, "{size:?}: {} where {} is right", got.value, expected.value);
+        assert!(off <= 2e-6, "{size:?}: {} instead of {}", got.value, expected.value);
         assert!(of_alpha <= 1e-5 && of_depth <= 1e-5, "{size:?}: {of_alpha:.1e}, {of_depth:.1e}");
         assert!(stages.depth_loss(&image, &target).unwrap() == got, "twice gave other bits");
     }

@@ -435,7 +435,7 @@ fn gltf_as_others_write_it() {
         let world = half_turn(turn * (mean * scale) + shift);
         let ours = DVec3::from_array(after.means[i].map(f64::from))
             + DVec3::from_array(loaded.file.origin);
-        // Those of the second mesh are a million units from the origin of all.
+        // The second mesh is a million units from the origin.
         assert!((world - ours).abs().max_element() < if i < 12 { 1e-5 } else { 0.1 }, "{i}");
         // The long axis of each splat.
         let axis = |q: [f32; 4]| {

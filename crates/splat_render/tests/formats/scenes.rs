@@ -121,11 +121,11 @@ impl Apart {
         apart
     }
 
-    /// Asserts that no difference is larger than that of `most`.
+    /// Asserts that no difference is larger than in `most`.
     pub fn assert_within(&self, most: &Self, what: &str) {
         let all = |a: &Self| [a.mean, a.scale, a.quat, a.opacity, a.color, a.rest];
         let within = all(self).iter().zip(all(most)).all(|(off, most)| *off <= most);
-        assert!(within, "{what}: {self:?} where {most:?} is allowed");
+        assert!(within, "{what}: {self:?}, allowed {most:?}");
     }
 }
 

@@ -9,7 +9,7 @@ use splat_render::gpu::needed_limits;
 
 use super::{Compiled, compiled};
 
-/// What one entry point uses: numbers by name. Globals that it does not touch do not count.
+/// Resources of one entry point, numbers by name; unused globals do not count.
 fn used(shader: &Compiled) -> BTreeMap<&'static str, u32> {
     let mut layouter = Layouter::default();
     layouter.update(shader.module.to_ctx()).expect("layout");
