@@ -284,7 +284,7 @@ def test_a_named_checkpoint(small_photos, tmp_path, monkeypatch):
     assert all(camera is not None for camera in found.cameras)
     content = (tmp_path / "model.safetensors").read_bytes()
     digest = hashlib.sha256(content).hexdigest()
-    assert found.weights == {"name": "da3-small", "licence": "Apache-2.0", "sha256": digest}
+    assert found.weights == {"name": "da3-small", "license": "Apache-2.0", "sha256": digest}
     # The license is kept with the cameras.
     of_photos = FoundCameras.of(small_photos, found, {"estimator": "da3"})
     kept = KeptCameras(of_photos, {}, Usage(0.0, 0.0, None))

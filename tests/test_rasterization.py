@@ -209,7 +209,7 @@ def test_radius_clip_drops_small_splats():
         assert torch.equal(kept, largest > clip)
 
 
-def optimisable(count=60):
+def trainable(count=60):
     """Parameters and optimizers as in gsplat's examples, and a target to fit."""
     truth = torch_scene(count=count, cameras=3, seed=3)
     with torch.no_grad():
@@ -264,7 +264,7 @@ def train(strategy, state, params, optimizers, truth, target, steps, packed, pos
 @pytest.mark.parametrize("packed", [False, True])
 def test_gsplat_default_strategy_runs_unchanged(packed):
     torch.manual_seed(0)
-    params, optimizers, truth, target = optimisable()
+    params, optimizers, truth, target = trainable()
     strategy = gsplat.DefaultStrategy(
         refine_start_iter=5, refine_every=10, grow_grad2d=1e-3, reset_every=1000
     )
@@ -310,7 +310,7 @@ def test_gsplat_mcmc_strategy_runs_unchanged(monkeypatch):
     monkeypatch.setattr(gsplat.strategy.ops, "compute_relocation", relocation_in_torch)
     monkeypatch.setattr(gsplat.strategy.ops, "quat_scale_to_covar_preci", covariance_in_torch)
     torch.manual_seed(0)
-    params, optimizers, truth, target = optimisable()
+    params, optimizers, truth, target = trainable()
     with torch.no_grad():
         params["opacities"][:7] = -8.0  # dead: there is something to relocate
     strategy = gsplat.MCMCStrategy(cap_max=70, refine_start_iter=5, refine_every=10, noise_lr=1.0)

@@ -214,7 +214,7 @@ def test_names():
     assert known_weights("da3-base").estimator == "da3"
     words = "no weights 'da3-giant'; name one of da3-base, da3-small"
     assert_refused(words, known_weights, "da3-giant")
-    assert all(one.fetched == ("NC" not in one.licence) for one in KNOWN.values())
+    assert all(one.fetched == ("NC" not in one.license) for one in KNOWN.values())
 
 
 def test_the_command(server, cache, igsr_here):

@@ -35,7 +35,7 @@ class Estimate:
             says none for all. ``igsr.estimate_poses`` undoes it.
         grids: per photo where its depth lies in the photo, None for depths of the whole photo; an
             empty list says that all are.
-        weights: of the network that was used: its "name", the "licence" that the publisher states
+        weights: of the network that was used: its "name", the "license" that the publisher states
             for weights of that name, and the "sha256" of its file, which tells whether it is those;
             None where there is none.
         evidence: per photo what its camera rests on, None where that is not known; an empty list

@@ -34,7 +34,7 @@ class Weights:
         model: "owner/name" on huggingface.co.
         files: names of the needed files, the weights first.
         size: bytes to download, approximately.
-        licence: SPDX identifier of the license that the publisher states.
+        license: SPDX identifier of the license that the publisher states.
         fetched: whether igsr downloads them. It does not download weights for non-commercial use,
             since the user has to accept their terms.
         purpose: description for users.
@@ -45,7 +45,7 @@ class Weights:
     model: str
     files: tuple[str, ...] = _FILES
     size: int
-    licence: str = "Apache-2.0"
+    license: str = "Apache-2.0"
     fetched: bool = True
     purpose: str
 
@@ -86,7 +86,7 @@ KNOWN = {
             estimator="dust3r",
             model="naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt",
             size=2_280_000_000,
-            licence="CC-BY-NC-SA-4.0",
+            license="CC-BY-NC-SA-4.0",
             fetched=False,
             purpose="points of pairs of photos; few photos from far apart",
         ),
@@ -152,7 +152,7 @@ def fetch_weights(name: str) -> Path:
     weights = known_weights(name)
     if not weights.fetched:
         raise IgsrError(
-            f"{name} is under {weights.licence}, which forbids commercial use, so igsr does not "
+            f"{name} is under {weights.license}, which forbids commercial use, so igsr does not "
             f"download it; accept its terms and get it from {weights.page}"
         )
     if os.environ.get(OFFLINE, "0") not in ("", "0"):

@@ -26,7 +26,7 @@ def list_command(as_json: JsonOption = False) -> None:
             {
                 "name": one.name,
                 "estimator": one.estimator,
-                "licence": one.licence,
+                "license": one.license,
                 "bytes": one.size,
                 "page": one.page,
                 "purpose": one.purpose,
@@ -41,7 +41,7 @@ def list_command(as_json: JsonOption = False) -> None:
         for one in KNOWN.values():
             state = "downloaded" if one.path else "not downloaded"
             console.print(
-                f"{one.name:15} {one.size / 1e9:4.2f} GB  {one.licence:16} {state:14}  "
+                f"{one.name:15} {one.size / 1e9:4.2f} GB  {one.license:16} {state:14}  "
                 f"--estimator {one.estimator}: {one.purpose}",
                 soft_wrap=True,
             )
@@ -54,7 +54,7 @@ def fetch_command(name: NameArgument) -> None:
     with error_messages(lambda: "Interrupted; the unfinished download is deleted."):
         weights = known_weights(name)
         if weights.fetched:
-            print_message(f"{name} is published under {weights.licence}: {weights.page}")
+            print_message(f"{name} is published under {weights.license}: {weights.page}")
         path = fetch_weights(name)
     typer.echo(path)
 

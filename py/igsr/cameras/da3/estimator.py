@@ -177,7 +177,7 @@ class Da3:
             )
         network = load_network(path)
         name = next(name for name, size in SIZES.items() if size == network.config)
-        weights = {"name": name, "licence": LICENSE, "sha256": sha256_of(path)}
+        weights = {"name": name, "license": LICENSE, "sha256": sha256_of(path)}
         return Da3Predictor(network), weights
 
 
