@@ -145,6 +145,19 @@ def test_render_writes_pictures_and_exr_with_floats_and_depth(fitted, capture_pa
     assert np.array_equal(igsr._core.read_exr_depth(str(path)), expected.expected_depth)
 
 
+def test_render_takes_the_cameras_of_a_fit(fitted, capture_path, tmp_path):
+    out = fitted[0]
+    succeeds("render", out / "scene.ply", "--cameras", out, "--out", tmp_path / "views")
+    splats = igsr.Splats.load(out / "scene.ply")
+    written = sorted(path for path in (tmp_path / "views").rglob("*.png"))
+    frames = json.loads((out / "cameras.json").read_text())["frames"]
+    assert len(written) == len(frames)
+    views = igsr.load_capture(capture_path).views
+    camera = next(view.camera for view in views if view.name.endswith(written[0].name))
+    expected = igsr.render(splats, camera, (1.0, 1.0, 1.0), "cpu").to_uint8()
+    assert np.array_equal(np.asarray(Image.open(written[0])), expected)
+
+
 @pytest.mark.parametrize("with_cameras", [False, True])
 def test_orbit_writes_a_video(fitted, capture_path, tmp_path, with_cameras):
     out, _ = fitted
