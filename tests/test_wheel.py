@@ -152,8 +152,10 @@ def test_the_viewer_draws_what_a_photo_shows(clean, fitted):
 def test_the_browser_view_answers_until_ctrl_c(clean, fitted):
     started = time.perf_counter()
     # Without a display it is the browser view.
-    command = [str(clean.bin / "igsr"), "view", "out"]
-    state, status, errors = view_until_ctrl_c(command, clean.folder, clean.variables)
+    program = [str(clean.bin / "igsr")]
+    _, state, status, errors = view_until_ctrl_c(
+        clean.folder, clean.variables, "out", program=program
+    )
     assert state["newest"] == "scene"
     print(f"{time.perf_counter() - started:6.1f} s  igsr view out, answer and end")
     assert status == 0, errors

@@ -47,10 +47,10 @@ def state_of(server):
     return json.loads(content)
 
 
-def started_view(folder, variables, *words):
+def started_view(folder, variables, *words, program=(sys.executable, "-m", "igsr.cli")):
     """The process of ``igsr view``."""
     return subprocess.Popen(
-        [sys.executable, "-m", "igsr.cli", "view", *map(str, words)],
+        [*program, "view", *map(str, words)],
         cwd=folder,
         env=variables,
         stdout=subprocess.PIPE,
@@ -61,9 +61,9 @@ def started_view(folder, variables, *words):
     )
 
 
-def view_until_ctrl_c(*started):
+def view_until_ctrl_c(*started, **options):
     """Start the browser view, read its state, and stop it; its address, state, status, stderr."""
-    process = started_view(*started)
+    process = started_view(*started, **options)
     try:
         url = process.stdout.readline().strip()
         here = url.replace("0.0.0.0", "127.0.0.1")
