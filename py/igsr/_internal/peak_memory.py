@@ -1,4 +1,4 @@
-"""The most memory that this process has had, and how to count it anew."""
+"""The peak memory of this process, and its reset."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ STATUS = Path("/proc/self/status")
 
 
 def peak_bytes() -> int | None:
-    """Largest resident size of this process since ``forget_peak``; None where no one says."""
+    """Largest resident size of this process since ``forget_peak``; None if unknown."""
     try:
         status = STATUS.read_text(encoding="ascii").splitlines()
         return 1024 * next(int(line.split()[1]) for line in status if line.startswith("VmHWM:"))
@@ -26,7 +26,7 @@ def peak_bytes() -> int | None:
 
 
 def forget_peak() -> bool:
-    """Let the peak start from what is resident now; False where the system cannot (Linux can)."""
+    """Reset the peak to the current resident size; return False if the system cannot."""
     try:
         CLEAR_REFS.write_text("5")
     except OSError:

@@ -1,4 +1,4 @@
-"""Read .npz files that may be damaged or hostile, and what that raises."""
+"""Read .npz files that may be damaged or hostile."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-#: What zipfile, numpy and json raise on damaged files. RuntimeError: members that are encrypted, of
-#: an unknown zip version or nested too deep; the syntax errors: array headers that do not parse;
-#: TypeError: an array alone, which is no archive.
+#: Exceptions of zipfile, numpy and json for damaged files. RuntimeError: encrypted members, an
+#: unknown zip version or nested members; syntax errors: invalid array headers; TypeError: an array
+#: without an archive.
 DAMAGE = (
     OSError,
     EOFError,
@@ -33,7 +33,7 @@ def stored_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
     """The arrays of a file that ``np.savez`` wrote: numbers, not compressed, by name.
 
     Raises:
-        OSError, ValueError, ...: ``DAMAGE``; the file is no such file.
+        OSError, ValueError, ...: ``DAMAGE``; the file is damaged or of another kind.
     """
     with zipfile.ZipFile(path) as archive:
         return {

@@ -63,7 +63,7 @@ def seam_scores(
 def seam_task(context: Context, plan: BlockPlan, splats: Splats) -> FitTask | None:
     """Make a short fit of the splats near seams; None if no photo shows any.
 
-    It has at most as many pixels as the largest block, so that it needs no more memory.
+    It is not larger than the largest block, so that it needs no more memory.
     """
     scene = context.out / "blocks" / "joined" / SPLATS_FILE
     scene_hash = hash_of(splat_arrays(splats).values())

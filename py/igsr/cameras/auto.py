@@ -16,7 +16,7 @@ from igsr.capture.photo_folder import Photo
 from igsr.capture.types import PoseEvidence
 from igsr.geometry.similarity import similarity_between
 
-#: Fewer photos placed by both COLMAP and the network do not determine where the others are.
+#: Minimum number of photos placed by both COLMAP and the network to place further photos.
 MIN_COMMON_PHOTOS = 3
 
 
@@ -49,7 +49,7 @@ def with_predicted_cameras(
 ) -> Estimate:
     """Add a network's cameras for the photos that features did not place.
 
-    A similarity transform takes the network's world to that of the features; its residuals are the
+    A similarity transform maps the network's world to the features' world; its residuals are the
     standard deviations of the added cameras.
 
     Args:

@@ -48,7 +48,7 @@ _NETWORKS = {
 
 
 def find_checkpoint(estimator: str, named: str | os.PathLike[str] | None = None) -> Path | None:
-    """Find a checkpoint: the named one, else that of the environment variable, else a cached one.
+    """Find a checkpoint: named, of the environment variable, or cached; the first that exists.
 
     The caches are huggingface_hub's and, for DUSt3R, torch.hub's (``checkpoints/NAME.pth``).
 

@@ -1,4 +1,4 @@
-"""The interface of pose estimators: what they take and what they return."""
+"""The interface of pose estimators: their arguments and results."""
 
 from __future__ import annotations
 
@@ -20,26 +20,24 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(eq=False)
 class Estimate:
-    """Cameras of photos in one world frame, and what else an estimator found.
+    """Cameras of photos in one world frame, with points and depths.
 
     Attributes:
         cameras: per photo, pinhole, in pixels of the photo (centers at +0.5), or None where the
             photo is not registered.
         points: in the world frame, with confidence, or None.
-        depths: per photo float32 [h, w], z-depth along the camera's axis in world units, NaN where
-            it is not known, at any resolution; or None.
-        trusted: per photo bool of the shape of its depth, True where the depth is confident; or
-            None.
+        depths: per photo float32 [h, w], z-depth along the camera's axis in world units, NaN if
+            unknown, at any resolution; or None.
+        trusted: per photo bool [h, w], True for confident depths; or None.
         warnings: messages for the user: which photos are not registered, and why.
-        lenses: per photo the distortion that ``cameras`` leave out, None for none; an empty list
-            says none for all. ``igsr.estimate_poses`` undoes it.
-        grids: per photo where its depth lies in the photo, None for depths of the whole photo; an
-            empty list says that all are.
-        weights: of the network that was used: its "name", the "license" that the publisher states
-            for weights of that name, and the "sha256" of its file, which tells whether it is those;
-            None where there is none.
-        evidence: per photo what its camera rests on, None where that is not known; an empty list
-            says that of all.
+        lenses: per photo the distortion that ``cameras`` leave out, or None; an empty list means
+            None for all. ``igsr.find_cameras`` undoes it.
+        grids: per photo the position of its depth in the photo, None for depths of the whole photo;
+            an empty list means None for all.
+        weights: "name" of the network's weights, the "license" that their publisher states, and the
+            "sha256" of the file; None without a network.
+        evidence: per photo the evidence for its camera, None if unknown; an empty list means None
+            for all.
     """
 
     cameras: list[Camera | None]

@@ -127,7 +127,7 @@ class FoundCameras:
 
 
 def _trusted_depths(photos: Sequence[Photo], estimate: Estimate) -> list[np.ndarray | None]:
-    """Depths of whole photos, 0 where they are unknown or not trusted."""
+    """Depths of whole photos, 0 if unknown or not trusted."""
     kept: list[np.ndarray | None] = []
     grids = estimate.grids or [None] * len(photos)
     found = zip(photos, estimate.depths, estimate.trusted, grids, strict=True)

@@ -46,7 +46,7 @@ def plot_poses(path: str | os.PathLike[str], capture: Capture) -> None:
         @ turn.T
         for view in capture.views
     ]
-    # Points far behind what is photographed would leave the cameras a speck.
+    # Very distant points would make the cameras tiny.
     corners = np.concatenate(frusta)
     near = (
         np.concatenate([corners, np.quantile(points, (0.05, 0.95), axis=0)])
@@ -89,7 +89,7 @@ def _upright(rotations: list[Float64]) -> Float64:
     if np.linalg.norm(down) < 1e-6:
         return np.eye(3)
     down /= np.linalg.norm(down)
-    # What lies least along down stands in where the cameras look every way round.
+    # Cameras that look in all directions have no mean: use the axis that is most horizontal.
     forward = np.mean([rotation[2] for rotation in rotations], axis=0)
     forward -= (forward @ down) * down
     if np.linalg.norm(forward) < 1e-3:

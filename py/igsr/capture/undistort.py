@@ -13,6 +13,7 @@ COLMAP's camera models, which agree with it.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -152,7 +153,7 @@ def _first_positive_root(polynomial: np.polynomial.Polynomial) -> float:
     return float(real.min()) if real.size else np.inf
 
 
-class Sampler:
+class Sampler(ABC):
     """Resamples photos bilinearly to another camera, a band of rows at a time.
 
     ``valid``, bool [H, W], is True for pixels of the new picture that the photo shows.
@@ -162,9 +163,9 @@ class Sampler:
         self.valid = np.ones((height, width), dtype=bool)
         self._weights_sum_to_one = weights_sum_to_one
 
+    @abstractmethod
     def _taps(self, band: slice) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Flat indices of the photo's pixels that each pixel of a band mixes, and their weights."""
-        raise NotImplementedError
 
     def _bands(self) -> Iterator[slice]:
         height, width = self.valid.shape

@@ -108,7 +108,7 @@ def _camera_fields(camera: Camera, to_world: np.ndarray) -> dict[str, Any]:
 
 
 def _to_world(camera: Camera) -> np.ndarray:
-    """The exact inverse of a rigid viewmat, unlike that of ``write_cameras``."""
+    """The exact inverse of a rigid viewmat, unlike in ``write_cameras``."""
     to_world = np.eye(4)
     to_world[:3, :3] = camera.viewmat[:3, :3].T
     to_world[:3, 3] = camera.center

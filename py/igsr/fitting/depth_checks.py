@@ -101,7 +101,7 @@ def _log_ratios(view: View, xyz: Float64, xy: Float64) -> Float64:
 
 
 def with_consistent_depths(views: Sequence[View]) -> list[View]:
-    """Remove depth maps that contradict those of the other photos.
+    """Remove depth maps that contradict other photos.
 
     Photos are compared in pairs. Of the groups of photos that agree, the largest is taken to be
     right; depth maps that contradict one of its photos are removed. If no group is larger than the

@@ -44,7 +44,7 @@ class PhotoFeatures:
 class Matcher(Protocol):
     """Features and matches for the estimator ``colmap``, which verifies them.
 
-    Features of a photo are found once and matched with those of every other photo.
+    Features of a photo are found once and matched with all photos.
 
     Attributes:
         name: for reports, and to recognize cameras found with it.
@@ -53,7 +53,7 @@ class Matcher(Protocol):
     name: str
 
     def features(self, image: npt.NDArray[np.uint8]) -> PhotoFeatures:
-        """Return features of a photo, RGB [H, W, 3]. Those of masked pixels are removed later."""
+        """Return features of a photo, RGB [H, W, 3]. Masked pixels are removed later."""
 
     def matches(self, first: PhotoFeatures, second: PhotoFeatures) -> npt.NDArray[np.uint32]:
         """Return pairs of feature indices [M, 2]; no feature is in two pairs."""

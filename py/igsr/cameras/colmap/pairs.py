@@ -1,6 +1,6 @@
 """Choose pairs of photos to match: all of few photos, similar ones of many.
 
-Of many photos, each is matched with those that follow it by name and those whose largest features
+Of many photos, each is matched with the next ones by name and with photos whose largest features
 match (Wu, "Towards Linear-time Incremental Structure from Motion", 3DV 2013, section 3).
 """
 
