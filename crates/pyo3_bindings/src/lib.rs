@@ -17,6 +17,7 @@ mod fit_state;
 mod fitter;
 mod level_files;
 mod photos;
+mod depth_maps;
 mod plane_sweep;
 mod splat_arrays;
 mod splat_files;
@@ -64,6 +65,8 @@ mod _core {
     use crate::fitter::{Fitter, splats_from_points};
     #[pymodule_export]
     use crate::level_files::{read_level, write_levels};
+    #[pymodule_export]
+    use crate::depth_maps::depth_maps;
     #[pymodule_export]
     use crate::plane_sweep::plane_sweep;
     #[pymodule_export]

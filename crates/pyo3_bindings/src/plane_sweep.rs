@@ -4,7 +4,7 @@ use numpy::PyUntypedArrayMethods;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList};
-use splat_render::fit::{GrayPhoto, Sweep};
+use splat_render::fit::plane_sweep::{GrayPhoto, Sweep};
 
 use crate::arrays::{array, elements, shaped};
 use crate::camera::cameras;
@@ -54,7 +54,7 @@ pub fn plane_sweep<'py>(
         .into_iter()
         .map(|(photo, others, range, planes)| Sweep { photo, others, range, planes })
         .collect();
-    let maps = py.detach(|| splat_render::fit::plane_sweep(&photos, &sweeps)).map_err(to_python)?;
+    let maps = py.detach(|| splat_render::fit::plane_sweep::plane_sweep(&photos, &sweeps)).map_err(to_python)?;
     let out = PyList::empty(py);
     for (map, sweep) in maps.into_iter().zip(&sweeps) {
         let (width, height) = sizes[sweep.photo];

@@ -1,0 +1,50 @@
+//! Which pixels' depths other photos' maps confirm.
+
+use super::DepthMap;
+use super::search::{PlaneMap, Stage, there_and_back};
+
+/// Minimum score of a pixel.
+const MIN_SCORE: f32 = 0.4;
+/// A map confirms a pixel whose image it maps back to within this many pixels and this fraction of depth.
+const MAX_OFF_PX: f32 = 1.0;
+const MAX_OFF_FRACTION: f32 = 0.01;
+/// Number of maps that must agree, or all that see the place.
+const CONFIRMING: usize = 2;
+
+/// The confirmed pixels of map `k`.
+pub fn confirmed(stage: &Stage<'_>, k: usize, maps: &[PlaneMap]) -> DepthMap {
+    let map = &maps[k];
+    let pixels = map.planes.len();
+    let mut out = DepthMap {
+        depth: vec![0.0; pixels],
+        normal: vec![[0.0; 3]; pixels],
+        confidence: vec![0.0; pixels],
+    };
+    for pixel in 0..pixels {
+        let (x, y) = ((pixel % map.width) as f32, (pixel / map.width) as f32);
+        let (plane, score) = (map.planes[pixel], map.scores[pixel]);
+        if score < MIN_SCORE {
+            continue;
+        }
+        let (mut agree, mut see) = (0, 0);
+        for pair in &stage.pairs {
+            let Some(other) = pair.map.map(|other| &maps[other]) else { continue };
+            let Some([column, row, _]) = pair.there.project(x, y, plane.inverse_depth) else {
+                continue;
+            };
+            let Some([back_x, back_y, depth]) = there_and_back(pair, other, column, row) else {
+                continue;
+            };
+            see += 1;
+            let is_near = (back_x - x).hypot(back_y - y) <= MAX_OFF_PX;
+            let is_as_deep = (depth * plane.inverse_depth - 1.0).abs() <= MAX_OFF_FRACTION;
+            agree += usize::from(is_near && is_as_deep);
+        }
+        if agree >= CONFIRMING.min(see.max(1)) {
+            out.depth[pixel] = 1.0 / plane.inverse_depth;
+            out.normal[pixel] = stage.own.normal(x, y, plane.slope);
+            out.confidence[pixel] = score.min(1.0) * (1.0 - 0.5f32.powi(agree as i32));
+        }
+    }
+    out
+}

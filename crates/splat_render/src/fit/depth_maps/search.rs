@@ -1,0 +1,444 @@
+//! The search for the plane of each pixel of a photo.
+
+use glam::Vec3;
+use pulp::{Simd, WithSimd};
+use rayon::prelude::*;
+
+use super::pairs::{Level, Warp, center_in};
+use super::patch::{Patch, Texture, UNSEEN};
+use super::{MAX_OTHERS, Search};
+use crate::cpu::dispatch;
+
+/// How far pixels are whose planes are tried, up to this many steps of two pixels in four directions
+/// (Xu and Tao 2019): along widening rays, and straight on.
+const NEAR_STEPS: i32 = 4;
+const FAR_STEPS: i32 = 11;
+/// Score that a depth loses which another photo's map contradicts, by the distance in pixels that a pixel
+/// is off after it was projected to that photo and, with its depth there, back.
+const CONTRADICTED: f32 = 0.2;
+const MAX_OFF_PX: f32 = 3.0;
+/// Maximum slope of planes: tangent of the angle between normal and ray.
+const MAX_SLOPE: f32 = 4.0;
+/// Planes within this many pixels in other photos and this slope are the same.
+const SAME_PX: f32 = 0.02;
+const SAME_SLOPE: f32 = 0.02;
+
+/// A plane through the ray of a pixel.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Plane {
+    /// At the pixel.
+    pub inverse_depth: f32,
+    /// Relative change of the inverse depth per unit of the image plane at depth 1, along x and y.
+    pub slope: [f32; 2],
+}
+
+/// The planes of a photo's pixels.
+#[derive(Debug, Clone)]
+pub struct PlaneMap {
+    pub width: usize,
+    pub height: usize,
+    pub planes: Vec<Plane>,
+    /// Mean correlation with the best photos in -1..=1, less what is contradicted.
+    pub scores: Vec<f32>,
+}
+
+/// Another photo.
+pub struct Pair<'a> {
+    pub level: &'a Level,
+    pub there: Warp,
+    pub back: Warp,
+    center: Vec3,
+    /// Which depth map is its.
+    pub map: Option<usize>,
+}
+
+/// A photo's search at one size.
+pub struct Stage<'a> {
+    pub own: &'a Level,
+    pub pairs: Vec<Pair<'a>>,
+    range: [f32; 2],
+    /// Distinguishes random numbers of photos and levels.
+    stream: u32,
+    is_first: bool,
+}
+
+impl<'a> Stage<'a> {
+    pub fn new(
+        levels: &[&'a Level],
+        search: &Search,
+        map_of: &[Option<usize>],
+        level: usize,
+    ) -> Self {
+        let own = levels[search.photo];
+        let pair = |&photo: &usize| {
+            let other = levels[photo];
+            Pair {
+                level: other,
+                there: Warp::new(own, other),
+                back: Warp::new(other, own),
+                center: center_in(own, other),
+                map: map_of[photo],
+            }
+        };
+        Self {
+            own,
+            pairs: search.others.iter().map(pair).collect(),
+            range: search.range,
+            stream: hash((level * 0x1_0000 + search.photo) as u32),
+            is_first: level == 0,
+        }
+    }
+
+    /// Random planes, or of the depth of the seeds.
+    pub fn random(&self, seeds: &[[f32; 3]], scale: f32) -> PlaneMap {
+        let (width, height) = (self.own.width, self.own.height);
+        let [near, far] = self.range;
+        let plane = |pixel| {
+            let mut random = Random::new(self.stream, 0, pixel);
+            Plane {
+                inverse_depth: far + (near - far) * random.uniform(),
+                slope: random_slope(&mut random),
+            }
+        };
+        let mut planes: Vec<Plane> = (0..width * height).map(plane).collect();
+        for &[column, row, inverse_depth] in seeds {
+            let (column, row) = ((column * scale) as usize, (row * scale) as usize);
+            if column < width && row < height {
+                planes[row * width + column].inverse_depth = inverse_depth.clamp(far, near);
+            }
+        }
+        PlaneMap { width, height, planes, scores: vec![UNSEEN; width * height] }
+    }
+
+    /// The planes of a photo of half the size.
+    pub fn doubled(&self, coarse: &PlaneMap) -> PlaneMap {
+        let (width, height) = (self.own.width, self.own.height);
+        let planes = (0..width * height).map(|pixel| {
+            let (column, row) = (pixel % width, pixel / width);
+            let (left, upper) =
+                ((column / 2).min(coarse.width - 1), (row / 2).min(coarse.height - 1));
+            let plane = coarse.planes[upper * coarse.width + left];
+            let x = column as f32 - (2.0 * left as f32 + 0.5);
+            let y = row as f32 - (2.0 * upper as f32 + 0.5);
+            self.moved(plane, x, y).unwrap_or(plane)
+        });
+        PlaneMap { width, height, planes: planes.collect(), scores: vec![UNSEEN; width * height] }
+    }
+
+    /// Improves planes; `maps` are those of all photos, or none to search without regard to them.
+    pub fn run(&self, mut map: PlaneMap, maps: &[PlaneMap], iterations: usize) -> PlaneMap {
+        let width = self.own.width;
+        for turn in 0..=2 * iterations {
+            // At first only scores what is there.
+            let color = (turn > 0).then_some(turn % 2);
+            let mut planes = map.planes.clone();
+            let mut scores = map.scores.clone();
+            planes
+                .par_chunks_mut(width)
+                .zip(scores.par_chunks_mut(width))
+                .enumerate()
+                .for_each(|(row, (planes, scores))| {
+                    let turn = turn as u32;
+                    dispatch(Row { stage: self, map: &map, maps, row, color, turn, planes, scores });
+                });
+            map.planes = planes;
+            map.scores = scores;
+        }
+        map
+    }
+
+    /// The plane where it meets the ray of the pixel at a distance in pixels, or None.
+    #[inline(always)]
+    pub fn moved(&self, plane: Plane, x: f32, y: f32) -> Option<Plane> {
+        let [fx, fy] = self.own.focal;
+        moved(plane, x / fx, y / fy)
+    }
+}
+
+#[inline(always)]
+pub fn moved(plane: Plane, x: f32, y: f32) -> Option<Plane> {
+    let factor = 1.0 + plane.slope[0] * x + plane.slope[1] * y;
+    (factor > 1e-3).then(|| Plane {
+        inverse_depth: plane.inverse_depth * factor,
+        slope: plane.slope.map(|v| v / factor),
+    })
+}
+
+/// A row of one iteration, compiled for the machine's widest instruction set.
+struct Row<'a> {
+    stage: &'a Stage<'a>,
+    map: &'a PlaneMap,
+    maps: &'a [PlaneMap],
+    row: usize,
+    /// Parity of the pixels to search; None to score all pixels' planes.
+    color: Option<usize>,
+    turn: u32,
+    planes: &'a mut [Plane],
+    scores: &'a mut [f32],
+}
+
+impl WithSimd for Row<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) {
+        let Self { stage, map, maps, row, color, turn, planes, scores } = self;
+        let step = if color.is_some() { 2 } else { 1 };
+        let start = color.map_or(0, |color| (row + color) % 2);
+        for column in (start..map.width).step_by(step) {
+            let pixel = row * map.width + column;
+            if !stage.own.texture.counts(pixel) {
+                continue;
+            }
+            let mut pixel = Pixel::new(stage, maps, column, row, map.planes[pixel]);
+            if color.is_some() {
+                pixel.score = map.scores[row * map.width + column];
+                pixel.take_from_nearby(map);
+                let random = Random::new(stage.stream, turn, row * map.width + column);
+                pixel.vary(random, turn, maps.is_empty());
+            } else {
+                pixel.score = pixel.score_of(pixel.plane);
+            }
+            planes[column] = pixel.plane;
+            scores[column] = pixel.score;
+        }
+    }
+}
+
+/// A pixel and its best plane so far.
+struct Pixel<'a> {
+    stage: &'a Stage<'a>,
+    maps: &'a [PlaneMap],
+    column: usize,
+    row: usize,
+    patch: Patch,
+    /// Where other photos would see the pixel at infinite depth.
+    infinite: [Vec3; MAX_OTHERS],
+    /// Change of the inverse depth, relative to it, that moves the pixel's image by one pixel in the
+    /// photo where it moves most.
+    step: f32,
+    plane: Plane,
+    score: f32,
+}
+
+impl<'a> Pixel<'a> {
+    #[inline(always)]
+    fn new(
+        stage: &'a Stage<'a>,
+        maps: &'a [PlaneMap],
+        column: usize,
+        row: usize,
+        plane: Plane,
+    ) -> Self {
+        let at = Vec3::new(column as f32, row as f32, 1.0);
+        let mut infinite = [Vec3::ZERO; MAX_OTHERS];
+        let mut most = 1e-6f32;
+        for (pair, infinite) in stage.pairs.iter().zip(&mut infinite) {
+            *infinite = pair.there.infinite * at;
+            let image = *infinite + pair.there.epipole * plane.inverse_depth;
+            if image.z > 1e-6 {
+                let along = pair.there.epipole - image * (pair.there.epipole.z / image.z);
+                most = most.max(along.x.hypot(along.y) * plane.inverse_depth / image.z);
+            }
+        }
+        let patch = Patch::at(&stage.own.texture, column, row);
+        Self {
+            stage,
+            maps,
+            column,
+            row,
+            patch,
+            infinite,
+            step: 1.0 / most,
+            plane,
+            score: UNSEEN,
+        }
+    }
+
+    /// Tries the best plane of each group of pixels of the other color.
+    #[inline(always)]
+    fn take_from_nearby(&mut self, map: &PlaneMap) {
+        for [x, y] in [[0, -1], [0, 1], [-1, 0], [1, 0]] {
+            let mut best = [(UNSEEN, 0, 0); 2];
+            for step in 0..FAR_STEPS {
+                let straight = [(x * (2 * step + 3), y * (2 * step + 3)), (0, 0)];
+                let widening = [
+                    (x * (step + 1) + y * step, y * (step + 1) + x * step),
+                    (x * (step + 1) - y * step, y * (step + 1) - x * step),
+                ];
+                let near = if step < NEAR_STEPS { &widening[..] } else { &[] };
+                for (best, group) in best.iter_mut().zip([near, &straight[..1]]) {
+                    for &(x, y) in group {
+                        let (column, row) = (self.column as i32 + x, self.row as i32 + y);
+                        if column < 0
+                            || row < 0
+                            || column >= map.width as i32
+                            || row >= map.height as i32
+                        {
+                            continue;
+                        }
+                        let score = map.scores[row as usize * map.width + column as usize];
+                        if score > best.0 {
+                            *best = (score, x, y);
+                        }
+                    }
+                }
+            }
+            for (score, x, y) in best {
+                if score > UNSEEN {
+                    let at = (self.row as i32 + y) as usize * map.width
+                        + (self.column as i32 + x) as usize;
+                    if let Some(plane) = self.stage.moved(map.planes[at], -x as f32, -y as f32) {
+                        self.try_plane(plane);
+                    }
+                }
+            }
+        }
+    }
+
+    /// Tries random changes of the plane, smaller from turn to turn.
+    #[inline(always)]
+    fn vary(&mut self, mut random: Random, turn: u32, is_free: bool) {
+        let [near, far] = self.stage.range;
+        if is_free {
+            let slope = random_slope(&mut random);
+            let inverse_depth = far + (near - far) * random.uniform();
+            self.try_plane(Plane { inverse_depth, slope: self.plane.slope });
+            self.try_plane(Plane { inverse_depth, slope });
+        }
+        let shrink = 0.6f32.powi((turn / 2) as i32);
+        let pixels = if self.stage.is_first { 4.0 } else { 1.0 } * shrink;
+        for kind in 0..3 {
+            let mut plane = self.plane;
+            if kind != 1 {
+                plane.inverse_depth *= 1.0 + self.step * pixels * (2.0 * random.uniform() - 1.0);
+            }
+            if kind != 0 {
+                let length = (0.2 + 0.8 * shrink) * random.uniform();
+                let [x, y] = random.direction();
+                plane.slope = [plane.slope[0] + length * x, plane.slope[1] + length * y];
+            }
+            self.try_plane(plane);
+        }
+    }
+
+    #[inline(always)]
+    fn try_plane(&mut self, plane: Plane) {
+        let [near, far] = self.stage.range;
+        let Plane { inverse_depth, slope } = plane;
+        let change = (inverse_depth - self.plane.inverse_depth).abs();
+        let turn = (slope[0] - self.plane.slope[0]).abs() + (slope[1] - self.plane.slope[1]).abs();
+        let is_same =
+            change < SAME_PX * self.step * self.plane.inverse_depth && turn < SAME_SLOPE;
+        if is_same
+            || !(far..=near).contains(&inverse_depth)
+            || slope[0].hypot(slope[1]) > MAX_SLOPE
+        {
+            return;
+        }
+        let score = self.score_of(plane);
+        if score > self.score {
+            (self.plane, self.score) = (plane, score);
+        }
+    }
+
+    /// Mean score of the two photos that agree best, since some may not see the surface.
+    #[inline(always)]
+    fn score_of(&self, plane: Plane) -> f32 {
+        let [fx, fy] = self.stage.own.focal;
+        let (x, y) = (self.column as f32, self.row as f32);
+        let dx = plane.inverse_depth * plane.slope[0] / fx;
+        let dy = plane.inverse_depth * plane.slope[1] / fy;
+        let at_origin = plane.inverse_depth - dx * x - dy * y;
+        let (mut first, mut second) = (UNSEEN, UNSEEN);
+        for (pair, infinite) in self.stage.pairs.iter().zip(&self.infinite) {
+            let Warp { infinite: turned, epipole } = &pair.there;
+            let image = *infinite + *epipole * plane.inverse_depth;
+            // Its camera must be on the same side of the plane.
+            if image.z < 1e-6 || Vec3::new(dx, dy, at_origin).dot(pair.center) > 0.98 {
+                continue;
+            }
+            let texture: &Texture = &pair.level.texture;
+            let along = (turned.x_axis + *epipole * dx, turned.y_axis + *epipole * dy);
+            let mut score = self.patch.correlation(texture, image, along.0, along.1);
+            if score > UNSEEN
+                && let Some(map) = pair.map.and_then(|map| self.maps.get(map))
+            {
+                let off = self.off(pair, map, image).min(MAX_OFF_PX);
+                score = (score - CONTRADICTED / MAX_OFF_PX * off).max(-0.99);
+            }
+            second = second.max(first.min(score));
+            first = first.max(score);
+        }
+        if second > UNSEEN { 0.5 * (first + second) } else { first }
+    }
+
+    /// Distance in pixels to where the map of the other photo has the pixel's image.
+    #[inline(always)]
+    fn off(&self, pair: &Pair<'_>, map: &PlaneMap, image: Vec3) -> f32 {
+        let scale = 1.0 / image.z;
+        let Some([column, row, _]) = there_and_back(pair, map, image.x * scale, image.y * scale)
+        else {
+            return MAX_OFF_PX;
+        };
+        (column - self.column as f32).hypot(row - self.row as f32)
+    }
+}
+
+/// The pixel and depth in the first photo of what the other photo's map has at (x, y), or None.
+#[inline(always)]
+pub fn there_and_back(pair: &Pair<'_>, map: &PlaneMap, x: f32, y: f32) -> Option<[f32; 3]> {
+    let (column, row) = ((x + 0.5).floor(), (y + 0.5).floor());
+    if !(column >= 0.0 && row >= 0.0 && column < map.width as f32 && row < map.height as f32) {
+        return None;
+    }
+    let at = row as usize * map.width + column as usize;
+    if map.scores[at] <= UNSEEN {
+        return None;
+    }
+    let [fx, fy] = pair.level.focal;
+    let plane = moved(map.planes[at], (x - column) / fx, (y - row) / fy)?;
+    pair.back.project(x, y, plane.inverse_depth)
+}
+
+/// Random numbers that depend on the pixel and the turn alone.
+struct Random(u32);
+
+impl Random {
+    #[inline(always)]
+    fn new(stream: u32, turn: u32, pixel: usize) -> Self {
+        Self(hash(stream ^ hash(turn.wrapping_mul(0x9E37_79B9) ^ hash(pixel as u32))))
+    }
+
+    /// In 0..1.
+    #[inline(always)]
+    fn uniform(&mut self) -> f32 {
+        self.0 = hash(self.0.wrapping_add(0x9E37_79B9));
+        (self.0 >> 8) as f32 * (1.0 / 16_777_216.0)
+    }
+
+    /// A vector in the unit disc, evenly distributed.
+    #[inline(always)]
+    fn direction(&mut self) -> [f32; 2] {
+        loop {
+            let [x, y] = [2.0 * self.uniform() - 1.0, 2.0 * self.uniform() - 1.0];
+            if x * x + y * y <= 1.0 {
+                return [x, y];
+            }
+        }
+    }
+}
+
+#[inline(always)]
+fn random_slope(random: &mut Random) -> [f32; 2] {
+    let length = 2.0 * random.uniform();
+    random.direction().map(|v| length * v)
+}
+
+/// Mixes the bits of a number (Wellons 2018, "lowbias32").
+#[inline(always)]
+fn hash(mut bits: u32) -> u32 {
+    bits = (bits ^ (bits >> 16)).wrapping_mul(0x7FEB_352D);
+    bits = (bits ^ (bits >> 15)).wrapping_mul(0x846C_A68B);
+    bits ^ (bits >> 16)
+}
