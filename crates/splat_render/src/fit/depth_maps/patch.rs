@@ -11,9 +11,9 @@ const LANES: usize = 8;
 /// Samples count less by their distance and by their difference from the patch's center (bilateral
 /// weights), with these deviations in pixels and gray levels: they may be on another surface.
 const SPACE_PX: f32 = 5.0;
-const GRAY: f32 = 24.0;
+const GRAY: f32 = 16.0;
 /// Variance of gray levels (0..255) that noise has: patches of less have no texture and score near 0.
-const NOISE: f32 = 2.0;
+const NOISE: f32 = 0.5;
 /// Fraction of the patch's weight that the other photo must see.
 const MIN_SEEN: f32 = 0.6;
 /// The score of a patch that the other photo does not see.
