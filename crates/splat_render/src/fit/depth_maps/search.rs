@@ -17,6 +17,10 @@ const FAR_STEPS: i32 = 11;
 /// is off after it was projected to that photo and, with its depth there, back.
 const CONTRADICTED: f32 = 0.2;
 const MAX_OFF_PX: f32 = 3.0;
+/// Maximum random change of depths, in pixels that it moves a pixel's image in another photo.
+const MAX_CHANGE_PX: f32 = 4.0;
+/// Distance of the depths beside one's depth, in such pixels.
+const CLIMB_PX: f32 = 0.4;
 /// Maximum slope of planes: tangent of the angle between normal and ray.
 const MAX_SLOPE: f32 = 4.0;
 /// Planes within this many pixels in other photos and this slope are the same.
@@ -59,7 +63,6 @@ pub struct Stage<'a> {
     range: [f32; 2],
     /// Distinguishes random numbers of photos and levels.
     stream: u32,
-    is_first: bool,
 }
 
 impl<'a> Stage<'a> {
@@ -85,7 +88,6 @@ impl<'a> Stage<'a> {
             pairs: search.others.iter().map(pair).collect(),
             range: search.range,
             stream: hash((level * 0x1_0000 + search.photo) as u32),
-            is_first: level == 0,
         }
     }
 
@@ -195,7 +197,7 @@ impl WithSimd for Row<'_> {
                 pixel.score = map.scores[row * map.width + column];
                 pixel.take_from_nearby(map);
                 let random = Random::new(stage.stream, turn, row * map.width + column);
-                pixel.vary(random, turn, maps.is_empty());
+                pixel.vary(random, maps.is_empty());
             } else {
                 pixel.score = pixel.score_of(pixel.plane);
             }
@@ -296,9 +298,9 @@ impl<'a> Pixel<'a> {
         }
     }
 
-    /// Tries random changes of the plane, smaller from turn to turn.
+    /// Tries random changes of the plane, or `is_free` also other planes.
     #[inline(always)]
-    fn vary(&mut self, mut random: Random, turn: u32, is_free: bool) {
+    fn vary(&mut self, mut random: Random, is_free: bool) {
         let [near, far] = self.stage.range;
         if is_free {
             let slope = random_slope(&mut random);
@@ -306,19 +308,36 @@ impl<'a> Pixel<'a> {
             self.try_plane(Plane { inverse_depth, slope: self.plane.slope });
             self.try_plane(Plane { inverse_depth, slope });
         }
-        let shrink = 0.6f32.powi((turn / 2) as i32);
-        let pixels = if self.stage.is_first { 4.0 } else { 1.0 } * shrink;
+        if !is_free {
+            self.climb();
+        }
         for kind in 0..3 {
             let mut plane = self.plane;
             if kind != 1 {
-                plane.inverse_depth *= 1.0 + self.step * pixels * (2.0 * random.uniform() - 1.0);
+                // Large and small changes alike.
+                let pixels = MAX_CHANGE_PX * 0.02f32.powf(random.uniform());
+                let sign = if random.uniform() < 0.5 { -1.0 } else { 1.0 };
+                plane.inverse_depth *= 1.0 + sign * self.step * pixels;
             }
             if kind != 0 {
-                let length = (0.2 + 0.8 * shrink) * random.uniform();
+                let length = 0.05f32.powf(random.uniform());
                 let [x, y] = random.direction();
                 plane.slope = [plane.slope[0] + length * x, plane.slope[1] + length * y];
             }
             self.try_plane(plane);
+        }
+    }
+
+    /// Tries the depth at the top of the parabola through the score and those of depths beside.
+    #[inline(always)]
+    fn climb(&mut self) {
+        let plane = self.plane;
+        let change = plane.inverse_depth * self.step * CLIMB_PX;
+        let beside = |sign: f32| Plane { inverse_depth: plane.inverse_depth + sign * change, ..plane };
+        let (before, after) = (self.score_of(beside(-1.0)), self.score_of(beside(1.0)));
+        let bend = before - 2.0 * self.score + after;
+        if bend < -1e-6 {
+            self.try_plane(beside((0.5 * (before - after) / bend).clamp(-1.5, 1.5)));
         }
     }
 
