@@ -26,7 +26,7 @@ pub fn confirmed(stage: &Stage<'_>, k: usize, maps: &[PlaneMap]) -> DepthMap {
         if score < MIN_SCORE {
             continue;
         }
-        let (mut agree, mut see) = (0, 0);
+        let (mut agree, mut see, mut sum) = (0, 0, 1.0);
         for pair in &stage.pairs {
             let Some(other) = pair.map.map(|other| &maps[other]) else { continue };
             let Some([column, row, _]) = pair.there.project(x, y, plane.inverse_depth) else {
@@ -37,11 +37,15 @@ pub fn confirmed(stage: &Stage<'_>, k: usize, maps: &[PlaneMap]) -> DepthMap {
             };
             see += 1;
             let is_near = (back_x - x).hypot(back_y - y) <= MAX_OFF_PX;
-            let is_as_deep = (depth * plane.inverse_depth - 1.0).abs() <= MAX_OFF_FRACTION;
-            agree += usize::from(is_near && is_as_deep);
+            let relative = depth * plane.inverse_depth;
+            if is_near && (relative - 1.0).abs() <= MAX_OFF_FRACTION {
+                agree += 1;
+                sum += relative;
+            }
         }
         if agree >= CONFIRMING.min(see.max(1)) {
-            out.depth[pixel] = 1.0 / plane.inverse_depth;
+            // The mean over all maps that agree is more precise than the pixel's own depth.
+            out.depth[pixel] = sum / (1 + agree) as f32 / plane.inverse_depth;
             out.normal[pixel] = stage.own.normal(x, y, plane.slope);
             out.confidence[pixel] = score.min(1.0) * (1.0 - 0.5f32.powi(agree as i32));
         }
