@@ -4,10 +4,10 @@ use super::DepthMap;
 use super::search::{PlaneMap, Stage, there_and_back};
 
 /// Minimum score of a pixel.
-const MIN_SCORE: f32 = 0.4;
+const MIN_SCORE: f32 = 0.5;
 /// A map confirms a pixel whose image it maps back to within this many pixels and this fraction of depth.
 const MAX_OFF_PX: f32 = 1.0;
-const MAX_OFF_FRACTION: f32 = 0.006;
+const MAX_OFF_FRACTION: f32 = 0.01;
 /// Number of maps that must agree, or all that see the place.
 const CONFIRMING: usize = 2;
 
