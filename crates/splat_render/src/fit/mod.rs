@@ -8,7 +8,6 @@ mod depth_maps;
 mod exposures;
 mod fitter;
 mod initial;
-pub mod plane_sweep;
 
 
 pub use cameras::{CameraConfig, CameraState, Cameras, Focal, PosePrior, scene_distance};

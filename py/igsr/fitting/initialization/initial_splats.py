@@ -4,7 +4,7 @@ The points of each initialization are
 
 * "points": those of the capture (COLMAP);
 * "depths": those of the capture, and points of the photos' depth maps (``given_depths``) or, if
-  photos have none, of depth maps by plane sweep (``plane_sweep``);
+  photos have none, of depth maps by stereo (``depth_maps``);
 * "hull": in the visual hull of photos with alpha (``visual_hull``);
 * "rays": on rays of photo pixels, at the depth where other photos agree best (``ray_depths``);
 * "sift": triangulated features and points between them (``sift_points``);
@@ -25,9 +25,9 @@ import numpy.typing as npt
 from igsr import _core
 from igsr.capture import Capture, Points, View
 from igsr.errors import IgsrError
+from igsr.fitting.initialization.depth_maps import depth_points, have_neighbors, viewed_target
 from igsr.fitting.initialization.given_depths import given_points, have_depths
 from igsr.fitting.initialization.photo_pixels import at_most
-from igsr.fitting.initialization.plane_sweep import can_sweep, sweep_target, swept_points
 from igsr.fitting.initialization.ray_depths import ray_points
 from igsr.fitting.initialization.sift_points import sift_points, with_points_between
 from igsr.fitting.initialization.visual_hull import hull_points, viewed_box
@@ -41,8 +41,8 @@ Generator = np.random.Generator
 DEFAULT_SPLATS = 20_000
 #: Number of points from depth maps, as a fraction of the maximum number of splats.
 DEPTHS_FRACTION = 0.5
-#: Minimum fraction of photos with another one from a similar direction for a plane sweep.
-MIN_SWEPT_FRACTION = 0.5
+#: Minimum fraction of photos with another one from a similar direction for depth maps.
+MIN_NEIGHBORS_FRACTION = 0.5
 #: Minimum number of points to start from.
 MIN_POINTS = 100
 #: Minimum number of triangulated features to start from.
@@ -91,8 +91,8 @@ def chosen_start(capture: Capture, start: str = "auto", wanted: int = DEFAULT_SP
         return "points"
     if has_alpha:
         return "points" if points >= MIN_POINTS else "hull"
-    target = sweep_target(views, None if capture.points is None else capture.points.xyz)
-    if can_sweep(views, target, fraction=MIN_SWEPT_FRACTION):
+    target = viewed_target(views, None if capture.points is None else capture.points.xyz)
+    if have_neighbors(views, target, fraction=MIN_NEIGHBORS_FRACTION):
         return "depths"
     return "points" if points >= MIN_POINTS else "sift"
 
@@ -210,7 +210,7 @@ def _with_depths(
             confidence = np.concatenate([np.ones(len(known)), confidence])
     else:
         count = wanted - len(known)
-        dense, colors = swept_points(views, known if len(known) else None, count, random)
+        dense, colors = depth_points(views, known if len(known) else None, count, random)
     return np.concatenate([known, dense]), np.concatenate([rgb, colors]), confidence
 
 

@@ -8,6 +8,8 @@ const MIN_SCORE: f32 = 0.5;
 /// A map confirms a pixel whose image it maps back to within this many pixels and this fraction of depth.
 const MAX_OFF_PX: f32 = 1.0;
 const MAX_OFF_FRACTION: f32 = 0.01;
+/// Distance in pixels that this fraction of the depth must move the pixel's image.
+const MIN_PARALLAX_PX: f32 = 0.05;
 /// Number of maps that must agree, or all that see the place.
 const CONFIRMING: usize = 2;
 
@@ -36,9 +38,14 @@ pub fn confirmed(stage: &Stage<'_>, k: usize, maps: &[PlaneMap]) -> DepthMap {
                 continue;
             };
             see += 1;
+            let farther = plane.inverse_depth * (1.0 - MAX_OFF_FRACTION);
+            let parallax = match pair.there.project(x, y, farther) {
+                Some([moved_x, moved_y, _]) => (moved_x - column).hypot(moved_y - row),
+                None => 0.0,
+            };
             let is_near = (back_x - x).hypot(back_y - y) <= MAX_OFF_PX;
             let relative = depth * plane.inverse_depth;
-            if is_near && (relative - 1.0).abs() <= MAX_OFF_FRACTION {
+            if is_near && parallax > MIN_PARALLAX_PX && (relative - 1.0).abs() <= MAX_OFF_FRACTION {
                 agree += 1;
                 sum += relative;
             }
