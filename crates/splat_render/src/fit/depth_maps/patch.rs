@@ -12,6 +12,8 @@ const LANES: usize = 8;
 /// weights), with these deviations in pixels and gray levels: they may be on another surface.
 const SPACE_PX: f32 = 5.0;
 const GRAY: f32 = 16.0;
+/// Least weight by difference: a plane fits a few samples by chance.
+const LEAST: f32 = 0.1;
 /// Variance of gray levels (0..255) that noise has: patches of less have no texture and score near 0.
 const NOISE: f32 = 0.5;
 /// Fraction of the patch's weight that the other photo must see.
@@ -77,7 +79,9 @@ impl Texture {
             quads,
             padded,
             offsets: std::array::from_fn(offsets),
-            by_gray: std::array::from_fn(|d| (-0.5 * (d as f32 / GRAY).powi(2)).exp()),
+            by_gray: std::array::from_fn(|d| {
+                LEAST + (1.0 - LEAST) * (-0.5 * (d as f32 / GRAY).powi(2)).exp()
+            }),
             by_place: std::array::from_fn(|i| {
                 (-0.5 * (x[i] * x[i] + y[i] * y[i]) / (SPACE_PX * SPACE_PX)).exp()
             }),
