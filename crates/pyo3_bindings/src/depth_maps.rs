@@ -10,7 +10,10 @@ use crate::arrays::{array, elements, rows, shaped, shaped_rows};
 use crate::camera::cameras;
 use crate::error::to_python;
 
-/// Depth maps of the photos that `searches` name: (photo, others, (nearest, farthest), seeds).
+/// The photo, those compared with, the inverse depths of the nearest and farthest surface, and seeds.
+type Searches<'py> = Vec<(usize, Vec<usize>, [f32; 2], PyReadonlyArrayDyn<'py, f32>)>;
+
+/// Depth maps of the photos that `searches` name.
 #[pyfunction]
 pub fn depth_maps<'py>(
     py: Python<'py>,
@@ -18,7 +21,7 @@ pub fn depth_maps<'py>(
     usable: &Bound<'py, PyList>,
     viewmats: &Bound<'py, PyAny>,
     intrinsics: &Bound<'py, PyAny>,
-    searches: Vec<(usize, Vec<usize>, [f32; 2], PyReadonlyArrayDyn<'py, f32>)>,
+    searches: Searches<'py>,
 ) -> PyResult<Bound<'py, PyList>> {
     if usable.len() != grays.len() {
         return Err(PyValueError::new_err("usable: must have an entry for each of grays"));

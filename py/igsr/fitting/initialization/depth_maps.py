@@ -28,13 +28,15 @@ Float64 = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
 Bool = npt.NDArray[np.bool_]
 
-#: Photos are compared if they look at the scene from within this angle. With these fractions of the
-#: angle's error, photos about ``BEST_ANGLE_DEG`` apart are compared first: closer ones have little
-#: parallax, farther ones see surfaces differently.
+#: Photos are compared if they look at the scene from within this angle. Those about
+#: ``BEST_ANGLE_DEG`` apart are preferred, with these deviations: nearer ones have little parallax,
+#: farther ones see surfaces differently.
 MAX_ANGLE_DEG = 60.0
 BEST_ANGLE_DEG = 15.0
 NEARER_DEG = 6.0
 FARTHER_DEG = 20.0
+#: Depth maps are worthwhile if photos have another one within this angle.
+NEIGHBOR_DEG = 50.0
 #: Number of photos to compare with, and the fraction of the scene that they must see.
 COMPARED_PHOTOS = 5
 MIN_OVERLAP = 0.1
@@ -85,7 +87,7 @@ def viewed_target(views: list[View], known: Float64 | None) -> Float64:
 
 
 def have_neighbors(
-    views: list[View], target: Float64, angle_deg: float = 40.0, fraction: float = 1.0
+    views: list[View], target: Float64, angle_deg: float = NEIGHBOR_DEG, fraction: float = 1.0
 ) -> bool:
     """Whether photos have another one that sees the target from within an angle.
 

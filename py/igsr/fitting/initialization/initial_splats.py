@@ -4,7 +4,7 @@ The points of each initialization are
 
 * "points": those of the capture (COLMAP);
 * "depths": those of the capture, and points of the photos' depth maps (``given_depths``) or, if
-  photos have none, of depth maps by stereo (``depth_maps``);
+  photos have none, of depth maps by stereo (``depth_maps``) and, of few photos, "sift";
 * "hull": in the visual hull of photos with alpha (``visual_hull``);
 * "rays": on rays of photo pixels, at the depth where other photos agree best (``ray_depths``);
 * "sift": triangulated features and points between them (``sift_points``);
@@ -47,6 +47,9 @@ MIN_NEIGHBORS_FRACTION = 0.5
 MIN_POINTS = 100
 #: Minimum number of triangulated features to start from.
 MIN_FEATURES = 30
+#: Triangulated features and points between them join those of depth maps of up to this many photos,
+#: which leave much unconfirmed.
+MAX_JOINED_PHOTOS = 12
 #: Splats per triangulated feature; with many more, novel views get worse.
 SPLATS_PER_FEATURE = 10
 #: Number of splats of a random initialization (3DGS has 100 000, for many photos).
@@ -209,8 +212,15 @@ def _with_depths(
             # Points of a capture are triangulated from several photos.
             confidence = np.concatenate([np.ones(len(known)), confidence])
     else:
-        count = wanted - len(known)
-        dense, colors = depth_points(views, known if len(known) else None, count, random)
+        seeds = known
+        if not len(known) and len(views) <= MAX_JOINED_PHOTOS:
+            features = sift_points(views)
+            if len(features[0]) >= MIN_FEATURES:
+                count = min(wanted // 2, DEFAULT_SPLATS, SPLATS_PER_FEATURE * len(features[0]))
+                seeds = features[0]
+                known, rgb = with_points_between(*features, count, random)
+        count = max(0, wanted - len(known))
+        dense, colors = depth_points(views, seeds if len(seeds) else None, count, random)
     return np.concatenate([known, dense]), np.concatenate([rgb, colors]), confidence
 
 

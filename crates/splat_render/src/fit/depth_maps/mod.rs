@@ -100,7 +100,11 @@ pub fn depth_maps(photos: &[GrayPhoto], searches: &[Search]) -> Result<Vec<Depth
                 .collect();
         }
         if level + 1 == count {
-            return Ok(stages.par_iter().enumerate().map(|(k, s)| confirmed(s, k, &maps)).collect());
+            return Ok(stages
+                .par_iter()
+                .enumerate()
+                .map(|(k, s)| confirmed(s, k, &maps))
+                .collect());
         }
     }
     Ok(Vec::new())
@@ -159,12 +163,13 @@ mod tests {
     fn photo(degrees: f64, gain: f32) -> GrayPhoto {
         let turn = DMat3::from_rotation_y(degrees.to_radians());
         let camera = Camera {
-            viewmat: DMat4::from_mat3(turn) + DMat4::from_cols(
-                glam::DVec4::ZERO,
-                glam::DVec4::ZERO,
-                glam::DVec4::ZERO,
-                (PLANE.0 - turn * PLANE.0).extend(0.0),
-            ),
+            viewmat: DMat4::from_mat3(turn)
+                + DMat4::from_cols(
+                    glam::DVec4::ZERO,
+                    glam::DVec4::ZERO,
+                    glam::DVec4::ZERO,
+                    (PLANE.0 - turn * PLANE.0).extend(0.0),
+                ),
             fx: 120.0,
             fy: 110.0,
             cx: 47.0,

@@ -12,8 +12,6 @@ const LANES: usize = 8;
 /// weights), with these deviations in pixels and gray levels: they may be on another surface.
 const SPACE_PX: f32 = 5.0;
 const GRAY: f32 = 16.0;
-/// Least weight by difference: a plane fits a few samples by chance.
-const LEAST: f32 = 0.1;
 /// Variance of gray levels (0..255) that noise has: patches of less have no texture and score near 0.
 const NOISE: f32 = 0.5;
 /// Fraction of the patch's weight that the other photo must see.
@@ -79,9 +77,7 @@ impl Texture {
             quads,
             padded,
             offsets: std::array::from_fn(offsets),
-            by_gray: std::array::from_fn(|d| {
-                LEAST + (1.0 - LEAST) * (-0.5 * (d as f32 / GRAY).powi(2)).exp()
-            }),
+            by_gray: std::array::from_fn(|d| (-0.5 * (d as f32 / GRAY).powi(2)).exp()),
             by_place: std::array::from_fn(|i| {
                 (-0.5 * (x[i] * x[i] + y[i] * y[i]) / (SPACE_PX * SPACE_PX)).exp()
             }),
@@ -178,7 +174,7 @@ impl Patch {
             *total = (halves[0] + halves[2]) + (halves[1] + halves[3]);
         }
         let [weight, ours, ours2, theirs, theirs2, both] = total;
-        if !(weight > MIN_SEEN * self.total) {
+        if weight <= MIN_SEEN * self.total {
             return UNSEEN;
         }
         let scale = 1.0 / weight;

@@ -135,14 +135,21 @@ impl<'a> Stage<'a> {
             let color = (turn > 0).then_some(turn % 2);
             let mut planes = map.planes.clone();
             let mut scores = map.scores.clone();
-            planes
-                .par_chunks_mut(width)
-                .zip(scores.par_chunks_mut(width))
-                .enumerate()
-                .for_each(|(row, (planes, scores))| {
+            planes.par_chunks_mut(width).zip(scores.par_chunks_mut(width)).enumerate().for_each(
+                |(row, (planes, scores))| {
                     let turn = turn as u32;
-                    dispatch(Row { stage: self, map: &map, maps, row, color, turn, planes, scores });
-                });
+                    dispatch(Row {
+                        stage: self,
+                        map: &map,
+                        maps,
+                        row,
+                        color,
+                        turn,
+                        planes,
+                        scores,
+                    });
+                },
+            );
             map.planes = planes;
             map.scores = scores;
         }
@@ -244,17 +251,7 @@ impl<'a> Pixel<'a> {
             }
         }
         let patch = Patch::at(&stage.own.texture, column, row);
-        Self {
-            stage,
-            maps,
-            column,
-            row,
-            patch,
-            infinite,
-            step: 1.0 / most,
-            plane,
-            score: UNSEEN,
-        }
+        Self { stage, maps, column, row, patch, infinite, step: 1.0 / most, plane, score: UNSEEN }
     }
 
     /// Tries the best plane of each group of pixels of the other color.
@@ -333,7 +330,8 @@ impl<'a> Pixel<'a> {
     fn climb(&mut self) {
         let plane = self.plane;
         let change = plane.inverse_depth * self.step * CLIMB_PX;
-        let beside = |sign: f32| Plane { inverse_depth: plane.inverse_depth + sign * change, ..plane };
+        let beside =
+            |sign: f32| Plane { inverse_depth: plane.inverse_depth + sign * change, ..plane };
         let (before, after) = (self.score_of(beside(-1.0)), self.score_of(beside(1.0)));
         let bend = before - 2.0 * self.score + after;
         if bend < -1e-6 {
@@ -347,11 +345,8 @@ impl<'a> Pixel<'a> {
         let Plane { inverse_depth, slope } = plane;
         let change = (inverse_depth - self.plane.inverse_depth).abs();
         let turn = (slope[0] - self.plane.slope[0]).abs() + (slope[1] - self.plane.slope[1]).abs();
-        let is_same =
-            change < SAME_PX * self.step * self.plane.inverse_depth && turn < SAME_SLOPE;
-        if is_same
-            || !(far..=near).contains(&inverse_depth)
-            || slope[0].hypot(slope[1]) > MAX_SLOPE
+        let is_same = change < SAME_PX * self.step * self.plane.inverse_depth && turn < SAME_SLOPE;
+        if is_same || !(far..=near).contains(&inverse_depth) || slope[0].hypot(slope[1]) > MAX_SLOPE
         {
             return;
         }
