@@ -84,7 +84,7 @@ fn halved(gray: &[f32], width: usize, height: usize) -> (Vec<f32>, usize, usize)
 pub struct Warp {
     /// At infinite depth.
     pub infinite: Mat3,
-    /// Added per unit of 1 / depth.
+    /// Added per unit of 1 / depth: the image of the first camera.
     pub epipole: Vec3,
 }
 
@@ -105,10 +105,4 @@ impl Warp {
         let scale = 1.0 / image.z;
         (image.z > 1e-6).then(|| [image.x * scale, image.y * scale, image.z / inverse_depth])
     }
-}
-
-/// The position of a camera as the first camera's homogeneous pixel times its depth.
-pub fn center_in(from: &Level, to: &Level) -> Vec3 {
-    let center = -(to.rotation.transpose() * to.translation);
-    (from.intrinsics * (from.rotation * center + from.translation)).as_vec3()
 }

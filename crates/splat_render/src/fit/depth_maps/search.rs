@@ -4,23 +4,21 @@ use glam::Vec3;
 use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
-use super::pairs::{Level, Warp, center_in};
+use super::pairs::{Level, Warp};
 use super::patch::{Patch, Texture, UNSEEN};
 use super::{MAX_OTHERS, Search};
 use crate::cpu::dispatch;
 
-/// How far pixels are whose planes are tried, up to this many steps of two pixels in four directions
-/// (Xu and Tao 2019): along widening rays, and straight on.
-const NEAR_STEPS: i32 = 4;
-const FAR_STEPS: i32 = 11;
+/// Pixels whose planes are tried, aside and ahead in four directions: the best of a widening ray, and the
+/// best of those straight on (Xu and Tao 2019).
+const NEAR: [[i32; 2]; 7] = [[0, 1], [1, 2], [-1, 2], [2, 3], [-2, 3], [3, 4], [-3, 4]];
+const FAR: [[i32; 2]; 7] = [[0, 3], [0, 5], [0, 7], [0, 11], [0, 15], [0, 19], [0, 23]];
 /// Score that a depth loses which another photo's map contradicts, by the distance in pixels that a pixel
 /// is off after it was projected to that photo and, with its depth there, back.
 const CONTRADICTED: f32 = 0.2;
 const MAX_OFF_PX: f32 = 3.0;
 /// Maximum random change of depths, in pixels that it moves a pixel's image in another photo.
 const MAX_CHANGE_PX: f32 = 4.0;
-/// Distance of the depths beside one's depth, in such pixels.
-const CLIMB_PX: f32 = 0.4;
 /// Maximum slope of planes: tangent of the angle between normal and ray.
 const MAX_SLOPE: f32 = 4.0;
 /// Planes within this many pixels in other photos and this slope are the same.
@@ -36,6 +34,18 @@ pub struct Plane {
     pub slope: [f32; 2],
 }
 
+impl Plane {
+    /// Where it meets the ray of the pixel at a distance in pixels, or None.
+    #[inline(always)]
+    fn moved(self, x: f32, y: f32, [fx, fy]: [f32; 2]) -> Option<Self> {
+        let factor = 1.0 + self.slope[0] * x / fx + self.slope[1] * y / fy;
+        (factor > 1e-3).then(|| Self {
+            inverse_depth: self.inverse_depth * factor,
+            slope: self.slope.map(|v| v / factor),
+        })
+    }
+}
+
 /// The planes of a photo's pixels.
 #[derive(Debug, Clone)]
 pub struct PlaneMap {
@@ -46,12 +56,20 @@ pub struct PlaneMap {
     pub scores: Vec<f32>,
 }
 
+impl PlaneMap {
+    #[inline(always)]
+    fn index(&self, column: i32, row: i32) -> Option<usize> {
+        let is_inside =
+            (0..self.width as i32).contains(&column) && (0..self.height as i32).contains(&row);
+        is_inside.then(|| row as usize * self.width + column as usize)
+    }
+}
+
 /// Another photo.
 pub struct Pair<'a> {
     pub level: &'a Level,
     pub there: Warp,
     pub back: Warp,
-    center: Vec3,
     /// Which depth map is its.
     pub map: Option<usize>,
 }
@@ -79,7 +97,6 @@ impl<'a> Stage<'a> {
                 level: other,
                 there: Warp::new(own, other),
                 back: Warp::new(other, own),
-                center: center_in(own, other),
                 map: map_of[photo],
             }
         };
@@ -122,7 +139,7 @@ impl<'a> Stage<'a> {
             let plane = coarse.planes[upper * coarse.width + left];
             let x = column as f32 - (2.0 * left as f32 + 0.5);
             let y = row as f32 - (2.0 * upper as f32 + 0.5);
-            self.moved(plane, x, y).unwrap_or(plane)
+            plane.moved(x, y, self.own.focal).unwrap_or(plane)
         });
         PlaneMap { width, height, planes: planes.collect(), scores: vec![UNSEEN; width * height] }
     }
@@ -155,22 +172,6 @@ impl<'a> Stage<'a> {
         }
         map
     }
-
-    /// The plane where it meets the ray of the pixel at a distance in pixels, or None.
-    #[inline(always)]
-    pub fn moved(&self, plane: Plane, x: f32, y: f32) -> Option<Plane> {
-        let [fx, fy] = self.own.focal;
-        moved(plane, x / fx, y / fy)
-    }
-}
-
-#[inline(always)]
-pub fn moved(plane: Plane, x: f32, y: f32) -> Option<Plane> {
-    let factor = 1.0 + plane.slope[0] * x + plane.slope[1] * y;
-    (factor > 1e-3).then(|| Plane {
-        inverse_depth: plane.inverse_depth * factor,
-        slope: plane.slope.map(|v| v / factor),
-    })
 }
 
 /// A row of one iteration, compiled for the machine's widest instruction set.
@@ -257,39 +258,22 @@ impl<'a> Pixel<'a> {
     /// Tries the best plane of each group of pixels of the other color.
     #[inline(always)]
     fn take_from_nearby(&mut self, map: &PlaneMap) {
-        for [x, y] in [[0, -1], [0, 1], [-1, 0], [1, 0]] {
-            let mut best = [(UNSEEN, 0, 0); 2];
-            for step in 0..FAR_STEPS {
-                let straight = [(x * (2 * step + 3), y * (2 * step + 3)), (0, 0)];
-                let widening = [
-                    (x * (step + 1) + y * step, y * (step + 1) + x * step),
-                    (x * (step + 1) - y * step, y * (step + 1) - x * step),
-                ];
-                let near = if step < NEAR_STEPS { &widening[..] } else { &[] };
-                for (best, group) in best.iter_mut().zip([near, &straight[..1]]) {
-                    for &(x, y) in group {
-                        let (column, row) = (self.column as i32 + x, self.row as i32 + y);
-                        if column < 0
-                            || row < 0
-                            || column >= map.width as i32
-                            || row >= map.height as i32
-                        {
-                            continue;
-                        }
-                        let score = map.scores[row as usize * map.width + column as usize];
-                        if score > best.0 {
-                            *best = (score, x, y);
-                        }
+        let (column, row) = (self.column as i32, self.row as i32);
+        for [cos, sin] in [[1, 0], [0, 1], [-1, 0], [0, -1]] {
+            for group in [&NEAR, &FAR] {
+                let mut best = (UNSEEN, None);
+                for &[aside, ahead] in group {
+                    let (x, y) = (aside * cos - ahead * sin, aside * sin + ahead * cos);
+                    if let Some(at) = map.index(column + x, row + y)
+                        && map.scores[at] > best.0
+                    {
+                        let moved =
+                            map.planes[at].moved(-x as f32, -y as f32, self.stage.own.focal);
+                        best = (map.scores[at], moved);
                     }
                 }
-            }
-            for (score, x, y) in best {
-                if score > UNSEEN {
-                    let at = (self.row as i32 + y) as usize * map.width
-                        + (self.column as i32 + x) as usize;
-                    if let Some(plane) = self.stage.moved(map.planes[at], -x as f32, -y as f32) {
-                        self.try_plane(plane);
-                    }
+                if let Some(plane) = best.1 {
+                    self.try_plane(plane);
                 }
             }
         }
@@ -305,9 +289,6 @@ impl<'a> Pixel<'a> {
             self.try_plane(Plane { inverse_depth, slope: self.plane.slope });
             self.try_plane(Plane { inverse_depth, slope });
         }
-        if !is_free {
-            self.climb();
-        }
         for kind in 0..3 {
             let mut plane = self.plane;
             if kind != 1 {
@@ -322,20 +303,6 @@ impl<'a> Pixel<'a> {
                 plane.slope = [plane.slope[0] + length * x, plane.slope[1] + length * y];
             }
             self.try_plane(plane);
-        }
-    }
-
-    /// Tries the depth at the top of the parabola through the score and those of depths beside.
-    #[inline(always)]
-    fn climb(&mut self) {
-        let plane = self.plane;
-        let change = plane.inverse_depth * self.step * CLIMB_PX;
-        let beside =
-            |sign: f32| Plane { inverse_depth: plane.inverse_depth + sign * change, ..plane };
-        let (before, after) = (self.score_of(beside(-1.0)), self.score_of(beside(1.0)));
-        let bend = before - 2.0 * self.score + after;
-        if bend < -1e-6 {
-            self.try_plane(beside((0.5 * (before - after) / bend).clamp(-1.5, 1.5)));
         }
     }
 
@@ -369,7 +336,7 @@ impl<'a> Pixel<'a> {
             let Warp { infinite: turned, epipole } = &pair.there;
             let image = *infinite + *epipole * plane.inverse_depth;
             // Its camera must be on the same side of the plane.
-            if image.z < 1e-6 || Vec3::new(dx, dy, at_origin).dot(pair.center) > 0.98 {
+            if image.z < 1e-6 || Vec3::new(dx, dy, at_origin).dot(pair.back.epipole) > 0.98 {
                 continue;
             }
             let texture: &Texture = &pair.level.texture;
@@ -378,7 +345,10 @@ impl<'a> Pixel<'a> {
             if score > UNSEEN
                 && let Some(map) = pair.map.and_then(|map| self.maps.get(map))
             {
-                let off = self.off(pair, map, image).min(MAX_OFF_PX);
+                let at = image * (1.0 / image.z);
+                let off = there_and_back(pair, map, at.x, at.y)
+                    .map_or(MAX_OFF_PX, |[back_x, back_y, _]| (back_x - x).hypot(back_y - y))
+                    .min(MAX_OFF_PX);
                 score = (score - CONTRADICTED / MAX_OFF_PX * off).max(-0.99);
             }
             second = second.max(first.min(score));
@@ -386,32 +356,14 @@ impl<'a> Pixel<'a> {
         }
         if second > UNSEEN { 0.5 * (first + second) } else { first }
     }
-
-    /// Distance in pixels to where the map of the other photo has the pixel's image.
-    #[inline(always)]
-    fn off(&self, pair: &Pair<'_>, map: &PlaneMap, image: Vec3) -> f32 {
-        let scale = 1.0 / image.z;
-        let Some([column, row, _]) = there_and_back(pair, map, image.x * scale, image.y * scale)
-        else {
-            return MAX_OFF_PX;
-        };
-        (column - self.column as f32).hypot(row - self.row as f32)
-    }
 }
 
 /// The pixel and depth in the first photo of what the other photo's map has at (x, y), or None.
 #[inline(always)]
 pub fn there_and_back(pair: &Pair<'_>, map: &PlaneMap, x: f32, y: f32) -> Option<[f32; 3]> {
     let (column, row) = ((x + 0.5).floor(), (y + 0.5).floor());
-    if !(column >= 0.0 && row >= 0.0 && column < map.width as f32 && row < map.height as f32) {
-        return None;
-    }
-    let at = row as usize * map.width + column as usize;
-    if map.scores[at] <= UNSEEN {
-        return None;
-    }
-    let [fx, fy] = pair.level.focal;
-    let plane = moved(map.planes[at], (x - column) / fx, (y - row) / fy)?;
+    let at = map.index(column as i32, row as i32).filter(|&at| map.scores[at] > UNSEEN)?;
+    let plane = map.planes[at].moved(x - column, y - row, pair.level.focal)?;
     pair.back.project(x, y, plane.inverse_depth)
 }
 
