@@ -4,9 +4,9 @@ use super::DepthMap;
 use super::search::{PlaneMap, Stage, there_and_back};
 
 /// Minimum score of a pixel.
-const MIN_SCORE: f32 = 0.5;
+const MIN_SCORE: f32 = 0.4;
 /// A map confirms a pixel whose image it maps back to within this many pixels and this fraction of depth.
-const MAX_OFF_PX: f32 = 1.0;
+const MAX_OFF_PX: f32 = 0.7;
 const MAX_OFF_FRACTION: f32 = 0.01;
 /// Distance in pixels that this fraction of the depth must move the pixel's image.
 const MIN_PARALLAX_PX: f32 = 0.05;

@@ -15,7 +15,7 @@ const NEAR: [[i32; 2]; 7] = [[0, 1], [1, 2], [-1, 2], [2, 3], [-2, 3], [3, 4], [
 const FAR: [[i32; 2]; 7] = [[0, 3], [0, 5], [0, 7], [0, 11], [0, 15], [0, 19], [0, 23]];
 /// Score that a depth loses which another photo's map contradicts, by the distance in pixels that a pixel
 /// is off after it was projected to that photo and, with its depth there, back.
-const CONTRADICTED: f32 = 0.4;
+const CONTRADICTED: f32 = 0.7;
 const MAX_OFF_PX: f32 = 3.0;
 /// Maximum random change of depths, in pixels that it moves a pixel's image in another photo.
 const MAX_CHANGE_PX: f32 = 4.0;
