@@ -239,7 +239,7 @@ def reduction(steps: int, coarse_to_fine: bool, step: int, longest: int) -> int:
 
 def depth_maps(
     grays: list[Float32],
-    usable: list[npt.NDArray[np.uint8] | None],
+    usable: list[npt.NDArray[np.uint8]],
     viewmats: Float64,
     intrinsics: Float64,
     searches: Sequence[tuple[int, Sequence[int], tuple[float, float], Float32]],
@@ -248,12 +248,12 @@ def depth_maps(
 
     Args:
         grays: gray in 0..1 of V photos, [H, W] each.
-        usable: which of their pixels count, [H, W], not 0 where they do; or None for all.
+        usable: which of their pixels count, [H, W], not 0 where they do.
         viewmats: [V, 4, 4], world-to-camera.
         intrinsics: [V, 4], fx, fy, cx, cy in pixels.
-        searches: (index of the photo, indices of up to 8 compared with, inverse depths of the nearest
-            and the farthest surface, known points [P, 3] as column, row and inverse depth), one for
-            each map.
+        searches: (index of the photo, indices of up to 8 compared with, inverse depths of the
+            nearest and the farthest surface, known points [P, 3] as column, row and inverse depth),
+            one for each map.
 
     Returns:
         For each search "depth" [H, W], 0 where nothing confirms it; "normal" [H, W, 3] towards the

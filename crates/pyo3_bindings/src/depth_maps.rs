@@ -37,21 +37,16 @@ pub fn depth_maps<'py>(
             u32::try_from(side).map_err(|_| PyValueError::new_err(format!("{name}: is too large")))
         };
         sizes.push((side(width)?, side(height)?));
-        let usable = if usable.is_none() {
-            None
-        } else {
-            let name = format!("usable[{i}]");
-            let bytes = array::<u8>(&name, &usable)?;
-            let bytes = elements(&name, &bytes, &[height as isize, width as isize])?;
-            Some(bytes.iter().map(|&byte| byte != 0).collect())
-        };
-        pixels.push((values, usable));
+        let name = format!("usable[{i}]");
+        let bytes = array::<u8>(&name, &usable)?;
+        let bytes = elements(&name, &bytes, &[height as isize, width as isize])?;
+        pixels.push((values, bytes.iter().map(|&byte| byte != 0).collect()));
     }
     let cameras = cameras(viewmats, intrinsics, &sizes)?;
     let photos: Vec<GrayPhoto> = cameras
         .into_iter()
         .zip(pixels)
-        .map(|(camera, (gray, usable))| GrayPhoto { camera, gray, usable })
+        .map(|(camera, (gray, usable))| GrayPhoto { camera, gray, usable: Some(usable) })
         .collect();
     let searches: Vec<Search> = searches
         .into_iter()

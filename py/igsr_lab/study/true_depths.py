@@ -46,7 +46,7 @@ def depths(study: Study, *, scenes: tuple[str, ...] = ("scene_00000", "scene_000
     """Compare depth maps by stereo with the true ones.
 
     Args:
-        study: its data has captures of ``synth``, which are seeded: the study has no seeds of its own.
+        study: its data has captures of ``synth``; the study has no seeds of its own.
         scenes: names of folders in the data.
 
     Returns:

@@ -148,7 +148,7 @@ def spread(rng: np.random.Generator, count: int, margin: float) -> np.ndarray:
 
 
 def at_angle(rig: Rig, turn: float, angle: float, count: int) -> tuple[Rig, np.ndarray]:
-    """A rig with cameras in a strip of triangles, whose sides are ``angle`` as the center sees them.
+    """A rig with cameras in a strip of triangles with sides of ``angle``, seen from the center.
 
     Args:
         rig: its distance, unsteadiness and lens are kept.

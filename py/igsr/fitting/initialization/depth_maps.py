@@ -1,8 +1,8 @@
-"""Depth maps by PatchMatch stereo, and points of their pixels that other photos' depth maps confirm.
+"""Depth maps by PatchMatch stereo, and points of them.
 
-The search is in Rust. A few wrong points hurt an initialization more than missing ones, so a pixel
-has a depth only if the depth maps of two other photos have the same surface, or of one if no more see
-the place (as in COLMAP's fusion, Schoenberger et al. 2016, section 4.5).
+A few wrong points hurt an initialization more than missing ones, so a pixel has a depth only if the
+depth maps of two other photos have the same surface, or that of one if no more see the place (as in
+COLMAP's fusion, Schoenberger et al. 2016, section 4.5).
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ def depth_maps(views: list[View], known: Float64 | None = None) -> list[DepthMap
     usable = [usable_pixels(view) for view in small]
     results = _core.depth_maps(
         [_luma(view, mask) for view, mask in zip(small, usable, strict=True)],
-        [None if mask.all() else mask.astype(np.uint8) for mask in usable],
+        [mask.astype(np.uint8) for mask in usable],
         np.stack([view.camera.viewmat for view in small]),
         np.stack([view.camera.K[[0, 1, 0, 1], [0, 1, 2, 2]] for view in small]),
         searches,

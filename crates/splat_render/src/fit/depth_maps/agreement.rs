@@ -39,10 +39,10 @@ pub fn confirmed(stage: &Stage<'_>, k: usize, maps: &[PlaneMap]) -> DepthMap {
             };
             see += 1;
             let farther = plane.inverse_depth * (1.0 - MAX_OFF_FRACTION);
-            let parallax = match pair.there.project(x, y, farther) {
-                Some([moved_x, moved_y, _]) => (moved_x - column).hypot(moved_y - row),
-                None => 0.0,
-            };
+            let parallax = pair
+                .there
+                .project(x, y, farther)
+                .map_or(0.0, |[x, y, _]| (x - column).hypot(y - row));
             let is_near = (back_x - x).hypot(back_y - y) <= MAX_OFF_PX;
             let relative = depth * plane.inverse_depth;
             if is_near && parallax > MIN_PARALLAX_PX && (relative - 1.0).abs() <= MAX_OFF_FRACTION {

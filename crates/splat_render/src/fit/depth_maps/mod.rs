@@ -17,8 +17,10 @@ use agreement::confirmed;
 use pairs::{Level, levels};
 use search::{PlaneMap, Stage};
 
-/// Photos are halved until their longer side has at most this many pixels, at most twice.
-const COARSEST_PX: usize = 160;
+/// Photos are halved until their sides have at most this many pixels, at most twice and not below the
+/// second number.
+const COARSEST_PX: u32 = 160;
+const MIN_SIDE_PX: u32 = 16;
 const MAX_LEVELS: usize = 3;
 /// Iterations at the coarsest level without regard to other maps; then stages of iterations after each
 /// of which the maps are exchanged, at the coarsest level and at the others.
@@ -66,9 +68,10 @@ pub struct DepthMap {
 /// threads.
 pub fn depth_maps(photos: &[GrayPhoto], searches: &[Search]) -> Result<Vec<DepthMap>> {
     check(photos, searches)?;
-    let longest = photos.iter().map(|photo| photo.camera.width.max(photo.camera.height)).max();
+    let sides = || photos.iter().flat_map(|photo| [photo.camera.width, photo.camera.height]);
+    let (least, most) = (sides().min().unwrap_or(0), sides().max().unwrap_or(0));
     let mut count = 1;
-    while count < MAX_LEVELS && longest.unwrap_or(0) as usize > COARSEST_PX << (count - 1) {
+    while count < MAX_LEVELS && most > COARSEST_PX << (count - 1) && least >> count >= MIN_SIDE_PX {
         count += 1;
     }
     let pyramids: Vec<Vec<Level>> = photos.par_iter().map(|photo| levels(photo, count)).collect();
@@ -79,32 +82,25 @@ pub fn depth_maps(photos: &[GrayPhoto], searches: &[Search]) -> Result<Vec<Depth
     let mut maps: Vec<PlaneMap> = Vec::new();
     for level in 0..count {
         let at_level: Vec<&Level> = pyramids.iter().map(|levels| &levels[level]).collect();
-        let stages: Vec<Stage> =
-            searches.iter().map(|search| Stage::new(&at_level, search, &map_of, level)).collect();
-        maps = stages
-            .par_iter()
-            .enumerate()
-            .map(|(k, stage)| match maps.get(k) {
-                Some(coarse) => stage.doubled(coarse),
-                None => {
-                    let scale = 0.5f32.powi(count as i32 - 1);
-                    stage.run(stage.random(&searches[k].seeds, scale), &[], FIRST_ITERATIONS)
-                }
-            })
+        let stages: Vec<Stage> = searches
+            .iter()
+            .map(|search| Stage::new(&at_level, search, &map_of, level as u32))
             .collect();
+        let first = |(k, stage): (usize, &Stage<'_>)| match maps.get(k) {
+            Some(coarse) => stage.doubled(coarse),
+            None => {
+                let scale = 0.5f32.powi(count as i32 - 1);
+                stage.run(stage.random(&searches[k].seeds, scale), &[], FIRST_ITERATIONS)
+            }
+        };
+        maps = stages.par_iter().enumerate().map(first).collect();
         for &iterations in STAGES[level.min(1)] {
-            maps = stages
-                .par_iter()
-                .enumerate()
-                .map(|(k, stage)| stage.run(maps[k].clone(), &maps, iterations))
-                .collect();
+            let next = |(k, map): (usize, &PlaneMap)| stages[k].run(map.clone(), &maps, iterations);
+            maps = maps.par_iter().enumerate().map(next).collect();
         }
         if level + 1 == count {
-            return Ok(stages
-                .par_iter()
-                .enumerate()
-                .map(|(k, s)| confirmed(s, k, &maps))
-                .collect());
+            let confirm = |k| confirmed(&stages[k], k, &maps);
+            return Ok((0..maps.len()).into_par_iter().map(confirm).collect());
         }
     }
     Ok(Vec::new())

@@ -20,8 +20,7 @@ pub struct Level {
 impl Level {
     /// Unit normal towards the camera, in its frame, of a plane with this slope (see `Plane`).
     pub fn normal(&self, x: f32, y: f32, [slope_x, slope_y]: [f32; 2]) -> [f32; 3] {
-        let ray = self.intrinsics.inverse() * DVec3::new(x.into(), y.into(), 1.0);
-        let ray = ray.as_vec3();
+        let ray = (self.intrinsics.inverse() * DVec3::new(x.into(), y.into(), 1.0)).as_vec3();
         let normal = -Vec3::new(slope_x, slope_y, 1.0 - slope_x * ray.x - slope_y * ray.y);
         normal.normalize().into()
     }
@@ -45,10 +44,8 @@ pub fn levels(photo: &GrayPhoto, count: usize) -> Vec<Level> {
             (gray, width, height) = halved(&gray, width, height);
             scale *= 0.5;
         }
-        let bytes: Vec<u8> = gray
-            .iter()
-            .map(|v| if v.is_nan() { 0 } else { (1.5 + 254.0 * v.clamp(0.0, 1.0)) as u8 })
-            .collect();
+        let byte = |v: &f32| if v.is_nan() { 0 } else { (1.5 + 254.0 * v.clamp(0.0, 1.0)) as u8 };
+        let bytes: Vec<u8> = gray.iter().map(byte).collect();
         let (fx, fy) = (scale * camera.fx, scale * camera.fy);
         let (cx, cy) = (scale * camera.cx - 0.5, scale * camera.cy - 0.5);
         out.push(Level {
@@ -71,10 +68,8 @@ fn halved(gray: &[f32], width: usize, height: usize) -> (Vec<f32>, usize, usize)
     let mean = |i: usize| {
         let at = 2 * (i / half_width) * width + 2 * (i % half_width);
         let four = [at, at + 1, at + width, at + width + 1].map(|pixel| gray[pixel]);
-        let (sum, count) = four
-            .iter()
-            .filter(|v| !v.is_nan())
-            .fold((0.0, 0), |(sum, count), v| (sum + v, count + 1));
+        let counted = four.iter().filter(|v| !v.is_nan());
+        let (sum, count) = counted.fold((0.0, 0), |(sum, count), v| (sum + v, count + 1));
         if count > 2 { sum / count as f32 } else { f32::NAN }
     };
     ((0..half_width * half_height).map(mean).collect(), half_width, half_height)

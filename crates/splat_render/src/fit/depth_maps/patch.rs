@@ -60,12 +60,7 @@ impl Texture {
         let quad = |i: usize| {
             let (row, column) = (i / (width + 1), i % (width + 1));
             let at = (row + RADIUS - 1) * stride + column + RADIUS - 1;
-            u32::from_le_bytes([
-                padded[at],
-                padded[at + 1],
-                padded[at + stride],
-                padded[at + stride + 1],
-            ])
+            u32::from_le_bytes([0, 1, stride, stride + 1].map(|step| padded[at + step]))
         };
         let quads = (0..(width + 1) * (height + 1)).map(quad).collect();
         let [x, y] = OFFSETS;

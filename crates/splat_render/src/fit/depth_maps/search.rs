@@ -21,6 +21,7 @@ const MAX_OFF_PX: f32 = 3.0;
 const MAX_CHANGE_PX: f32 = 4.0;
 /// Maximum slope of planes: tangent of the angle between normal and ray.
 const MAX_SLOPE: f32 = 4.0;
+const MAX_RANDOM_SLOPE: f32 = 2.0;
 /// Planes within this many pixels in other photos and this slope are the same.
 const SAME_PX: f32 = 0.02;
 const SAME_SLOPE: f32 = 0.02;
@@ -84,27 +85,19 @@ pub struct Stage<'a> {
 }
 
 impl<'a> Stage<'a> {
-    pub fn new(
-        levels: &[&'a Level],
-        search: &Search,
-        map_of: &[Option<usize>],
-        level: usize,
-    ) -> Self {
+    /// `maps` has the index of each photo's map.
+    pub fn new(levels: &[&'a Level], search: &Search, maps: &[Option<usize>], size: u32) -> Self {
         let own = levels[search.photo];
         let pair = |&photo: &usize| {
-            let other = levels[photo];
-            Pair {
-                level: other,
-                there: Warp::new(own, other),
-                back: Warp::new(other, own),
-                map: map_of[photo],
-            }
+            let level = levels[photo];
+            let (there, back) = (Warp::new(own, level), Warp::new(level, own));
+            Pair { level, there, back, map: maps[photo] }
         };
         Self {
             own,
             pairs: search.others.iter().map(pair).collect(),
             range: search.range,
-            stream: hash((level * 0x1_0000 + search.photo) as u32),
+            stream: hash(size * 0x1_0000 + search.photo as u32),
         }
     }
 
@@ -114,10 +107,8 @@ impl<'a> Stage<'a> {
         let [near, far] = self.range;
         let plane = |pixel| {
             let mut random = Random::new(self.stream, 0, pixel);
-            Plane {
-                inverse_depth: far + (near - far) * random.uniform(),
-                slope: random_slope(&mut random),
-            }
+            let inverse_depth = far + (near - far) * random.uniform();
+            Plane { inverse_depth, slope: random.direction().map(|v| MAX_RANDOM_SLOPE * v) }
         };
         let mut planes: Vec<Plane> = (0..width * height).map(plane).collect();
         for &[column, row, inverse_depth] in seeds {
@@ -152,21 +143,10 @@ impl<'a> Stage<'a> {
             let color = (turn > 0).then_some(turn % 2);
             let mut planes = map.planes.clone();
             let mut scores = map.scores.clone();
-            planes.par_chunks_mut(width).zip(scores.par_chunks_mut(width)).enumerate().for_each(
-                |(row, (planes, scores))| {
-                    let turn = turn as u32;
-                    dispatch(Row {
-                        stage: self,
-                        map: &map,
-                        maps,
-                        row,
-                        color,
-                        turn,
-                        planes,
-                        scores,
-                    });
-                },
-            );
+            let rows = planes.par_chunks_mut(width).zip(scores.par_chunks_mut(width)).enumerate();
+            rows.for_each(|(row, (planes, scores))| {
+                dispatch(Row { stage: self, map: &map, maps, row, color, turn, planes, scores });
+            });
             map.planes = planes;
             map.scores = scores;
         }
@@ -182,7 +162,7 @@ struct Row<'a> {
     row: usize,
     /// Parity of the pixels to search; None to score all pixels' planes.
     color: Option<usize>,
-    turn: u32,
+    turn: usize,
     planes: &'a mut [Plane],
     scores: &'a mut [f32],
 }
@@ -192,25 +172,25 @@ impl WithSimd for Row<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, _: S) {
-        let Self { stage, map, maps, row, color, turn, planes, scores } = self;
-        let step = if color.is_some() { 2 } else { 1 };
-        let start = color.map_or(0, |color| (row + color) % 2);
+        let (stage, map) = (self.stage, self.map);
+        let step = if self.color.is_some() { 2 } else { 1 };
+        let start = self.color.map_or(0, |color| (self.row + color) % 2);
         for column in (start..map.width).step_by(step) {
-            let pixel = row * map.width + column;
-            if !stage.own.texture.counts(pixel) {
+            let at = self.row * map.width + column;
+            if !stage.own.texture.counts(at) {
                 continue;
             }
-            let mut pixel = Pixel::new(stage, maps, column, row, map.planes[pixel]);
-            if color.is_some() {
-                pixel.score = map.scores[row * map.width + column];
+            let mut pixel = Pixel::new(&self, column, map.planes[at]);
+            if self.color.is_some() {
+                pixel.score = map.scores[at];
                 pixel.take_from_nearby(map);
-                let random = Random::new(stage.stream, turn, row * map.width + column);
-                pixel.vary(random, maps.is_empty());
+                let random = Random::new(stage.stream, self.turn as u32, at);
+                pixel.vary(random, self.maps.is_empty());
             } else {
                 pixel.score = pixel.score_of(pixel.plane);
             }
-            planes[column] = pixel.plane;
-            scores[column] = pixel.score;
+            self.planes[column] = pixel.plane;
+            self.scores[column] = pixel.score;
         }
     }
 }
@@ -233,13 +213,8 @@ struct Pixel<'a> {
 
 impl<'a> Pixel<'a> {
     #[inline(always)]
-    fn new(
-        stage: &'a Stage<'a>,
-        maps: &'a [PlaneMap],
-        column: usize,
-        row: usize,
-        plane: Plane,
-    ) -> Self {
+    fn new(row: &Row<'a>, column: usize, plane: Plane) -> Self {
+        let &Row { stage, maps, row, .. } = row;
         let at = Vec3::new(column as f32, row as f32, 1.0);
         let mut infinite = [Vec3::ZERO; MAX_OTHERS];
         let mut most = 1e-6f32;
@@ -284,7 +259,7 @@ impl<'a> Pixel<'a> {
     fn vary(&mut self, mut random: Random, is_free: bool) {
         let [near, far] = self.stage.range;
         if is_free {
-            let slope = random_slope(&mut random);
+            let slope = random.direction().map(|v| MAX_RANDOM_SLOPE * v);
             let inverse_depth = far + (near - far) * random.uniform();
             self.try_plane(Plane { inverse_depth, slope: self.plane.slope });
             self.try_plane(Plane { inverse_depth, slope });
@@ -393,12 +368,6 @@ impl Random {
             }
         }
     }
-}
-
-#[inline(always)]
-fn random_slope(random: &mut Random) -> [f32; 2] {
-    let length = 2.0 * random.uniform();
-    random.direction().map(|v| length * v)
 }
 
 /// Mixes the bits of a number (Wellons 2018, "lowbias32").
