@@ -3,8 +3,9 @@
 use super::DepthMap;
 use super::search::{PlaneMap, Stage, there_and_back};
 
-/// Minimum score of a pixel.
+/// Minimum score of a pixel, and of one that a single map confirms.
 const MIN_SCORE: f32 = 0.4;
+const MIN_SCORE_OF_ONE: f32 = 0.7;
 /// A map confirms a pixel whose image it maps back to within this many pixels and this fraction of depth.
 const MAX_OFF_PX: f32 = 0.7;
 const MAX_OFF_FRACTION: f32 = 0.01;
@@ -17,11 +18,8 @@ const CONFIRMING: usize = 2;
 pub fn confirmed(stage: &Stage<'_>, k: usize, maps: &[PlaneMap]) -> DepthMap {
     let map = &maps[k];
     let pixels = map.planes.len();
-    let mut out = DepthMap {
-        depth: vec![0.0; pixels],
-        normal: vec![[0.0; 3]; pixels],
-        confidence: vec![0.0; pixels],
-    };
+    let (depth, confidence) = (vec![0.0; pixels], vec![0.0; pixels]);
+    let mut out = DepthMap { depth, normal: vec![[0.0; 3]; pixels], confidence };
     for pixel in 0..pixels {
         let (x, y) = ((pixel % map.width) as f32, (pixel / map.width) as f32);
         let (plane, score) = (map.planes[pixel], map.scores[pixel]);
@@ -50,7 +48,8 @@ pub fn confirmed(stage: &Stage<'_>, k: usize, maps: &[PlaneMap]) -> DepthMap {
                 sum += relative;
             }
         }
-        if agree >= CONFIRMING.min(see.max(1)) {
+        let is_sure = agree >= CONFIRMING || score >= MIN_SCORE_OF_ONE;
+        if agree >= CONFIRMING.min(see.max(1)) && is_sure {
             // The mean over all maps that agree is more precise than the pixel's own depth.
             out.depth[pixel] = sum / (1 + agree) as f32 / plane.inverse_depth;
             out.normal[pixel] = stage.own.normal(x, y, plane.slope);
