@@ -128,7 +128,7 @@ def test_known_points_are_seeds_and_narrow_the_range_of_depths(monkeypatch):
     monkeypatch.setattr(_core, "depth_maps", lambda *arguments: given.append(arguments[-1]) or [])
 
     def depth_range(known):
-        with pytest.raises(ValueError, match="zip"):  # there is no map for the searches
+        with pytest.raises(ValueError, match="zip"):  # no maps are returned
             depth_maps(views, known)
         _, others, (near, far), seeds = given[-1][0]
         assert sorted(others) == [1, 2]

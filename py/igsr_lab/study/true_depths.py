@@ -46,7 +46,7 @@ def depths(study: Study, *, scenes: tuple[str, ...] = ("scene_00000", "scene_000
     """Compare depth maps by stereo with the true ones.
 
     Args:
-        study: its data has captures of ``synth``; the study has no seeds of its own.
+        study: its data has captures of ``synth``; the number of seeds does not matter.
         scenes: names of folders in the data.
 
     Returns:
@@ -87,7 +87,7 @@ def run_depths(data: str, run: DepthRun) -> Row:
 
 
 def _true_depth(folder: Path, view: View) -> Float32:
-    """The true depth at the centers of a photo's pixels, 0 where there is none."""
+    """The true depth at the centers of a photo's pixels, 0 for none."""
     depth = np.load(folder / "depth" / Path(view.name).with_suffix(".npy"))
     indices = [
         ((np.arange(count) + 0.5) * of / count).astype(np.int64)

@@ -1,8 +1,8 @@
 """Depth maps by PatchMatch stereo, and points of them.
 
 A few wrong points hurt an initialization more than missing ones, so a pixel has a depth only if the
-depth maps of two other photos have the same surface, or that of one if no more see the place (as in
-COLMAP's fusion, Schoenberger et al. 2016, section 4.5).
+depth maps of two other photos have the same surface, or one depth map if no more photos see the
+place (as in COLMAP's fusion, Schoenberger et al. 2016, section 4.5).
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class DepthMap:
 
     Attributes:
         view: the photo, reduced to at most ``MAX_SIDE_PX``.
-        depth: float32 [H, W], z-depth in world units; 0 where no other photo confirms it.
+        depth: float32 [H, W], z-depth in world units; 0 if no other photo confirms it.
         normal: float32 [H, W, 3], unit normals towards the camera, in its frame; 0 without depth.
         confidence: float32 [H, W] in 0..1, by correlation and by how many photos confirm it.
     """

@@ -47,8 +47,8 @@ MIN_NEIGHBORS_FRACTION = 0.5
 MIN_POINTS = 100
 #: Minimum number of triangulated features to start from.
 MIN_FEATURES = 30
-#: Triangulated features and points between them join those of depth maps of up to this many photos,
-#: which leave much unconfirmed.
+#: Triangulated features and points between them are added to depth maps of up to this many photos:
+#: depth maps of few photos have large gaps.
 MAX_JOINED_PHOTOS = 12
 #: Splats per triangulated feature; with many more, novel views get worse.
 SPLATS_PER_FEATURE = 10

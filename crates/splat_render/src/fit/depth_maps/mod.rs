@@ -22,8 +22,8 @@ use search::{PlaneMap, Stage};
 const COARSEST_PX: u32 = 160;
 const MIN_SIDE_PX: u32 = 16;
 const MAX_LEVELS: usize = 3;
-/// Iterations at the coarsest level without regard to other maps; then stages of iterations after each
-/// of which the maps are exchanged, at the coarsest level and at the others.
+/// Iterations at the coarsest level without other photos' maps; then iterations of each stage with them,
+/// at the coarsest level and at finer levels. The maps are exchanged between stages.
 const FIRST_ITERATIONS: usize = 6;
 const STAGES: [&[usize]; 2] = [&[2, 1], &[1, 1]];
 /// Maximum number of photos that one is compared with.
@@ -64,7 +64,7 @@ pub struct DepthMap {
     pub confidence: Vec<f32>,
 }
 
-/// The depth map of each search's photo, of which each has at most one. The same on any number of
+/// The depth map of each search's photo; a photo has at most one search. The same on any number of
 /// threads.
 pub fn depth_maps(photos: &[GrayPhoto], searches: &[Search]) -> Result<Vec<DepthMap>> {
     check(photos, searches)?;

@@ -30,7 +30,7 @@ impl Level {
 pub fn levels(photo: &GrayPhoto, count: usize) -> Vec<Level> {
     let camera = &photo.camera;
     let (mut width, mut height) = (camera.width as usize, camera.height as usize);
-    // NaN where pixels do not count.
+    // NaN for pixels that do not count.
     let mut gray = photo.gray.clone();
     for (value, usable) in gray.iter_mut().zip(photo.usable.iter().flatten()) {
         if !usable {
@@ -62,7 +62,7 @@ pub fn levels(photo: &GrayPhoto, count: usize) -> Vec<Level> {
     out
 }
 
-/// Means of 2 x 2 pixels, of which most must count.
+/// Means of 2 x 2 pixels; at least three must count.
 fn halved(gray: &[f32], width: usize, height: usize) -> (Vec<f32>, usize, usize) {
     let (half_width, half_height) = (width / 2, height / 2);
     let mean = |i: usize| {

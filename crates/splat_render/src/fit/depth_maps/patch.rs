@@ -14,9 +14,9 @@ const SPACE_PX: f32 = 5.0;
 const GRAY: f32 = 12.0;
 /// Variance of gray levels (0..255) that noise has: patches of less have no texture and score near 0.
 const NOISE: f32 = 0.5;
-/// Fraction of the patch's weight that the other photo must see.
+/// Fraction of the patch's weight that must be visible in another photo.
 const MIN_SEEN: f32 = 0.6;
-/// The score of a patch that the other photo does not see.
+/// The score of a patch that another photo does not see.
 pub const UNSEEN: f32 = -1.0;
 
 const fn offsets() -> [[f32; SAMPLES]; 2] {
@@ -34,7 +34,7 @@ const fn offsets() -> [[f32; SAMPLES]; 2] {
     out
 }
 
-/// A photo's gray levels 1..=255, prepared for patches; 0 where a pixel does not count.
+/// A photo's gray levels 1..=255, prepared for patches; 0 for pixels that do not count.
 pub struct Texture {
     width: usize,
     height: usize,

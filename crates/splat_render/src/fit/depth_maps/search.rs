@@ -36,7 +36,7 @@ pub struct Plane {
 }
 
 impl Plane {
-    /// Where it meets the ray of the pixel at a distance in pixels, or None.
+    /// The same plane at the ray of a pixel at this distance in pixels, or None.
     #[inline(always)]
     fn moved(self, x: f32, y: f32, [fx, fy]: [f32; 2]) -> Option<Self> {
         let factor = 1.0 + self.slope[0] * x / fx + self.slope[1] * y / fy;
@@ -53,7 +53,7 @@ pub struct PlaneMap {
     pub width: usize,
     pub height: usize,
     pub planes: Vec<Plane>,
-    /// Mean correlation with the best photos in -1..=1, less what is contradicted.
+    /// Mean correlation with the best photos in -1..=1, less the loss by other maps.
     pub scores: Vec<f32>,
 }
 
@@ -135,11 +135,11 @@ impl<'a> Stage<'a> {
         PlaneMap { width, height, planes: planes.collect(), scores: vec![UNSEEN; width * height] }
     }
 
-    /// Improves planes; `maps` are those of all photos, or none to search without regard to them.
+    /// Improves planes; `maps` are those of all photos, or none to search without them.
     pub fn run(&self, mut map: PlaneMap, maps: &[PlaneMap], iterations: usize) -> PlaneMap {
         let width = self.own.width;
         for turn in 0..=2 * iterations {
-            // At first only scores what is there.
+            // The first turn only scores the given planes.
             let color = (turn > 0).then_some(turn % 2);
             let mut planes = map.planes.clone();
             let mut scores = map.scores.clone();
@@ -202,10 +202,10 @@ struct Pixel<'a> {
     column: usize,
     row: usize,
     patch: Patch,
-    /// Where other photos would see the pixel at infinite depth.
+    /// Homogeneous images of the pixel at infinite depth, in other photos.
     infinite: [Vec3; MAX_OTHERS],
-    /// Change of the inverse depth, relative to it, that moves the pixel's image by one pixel in the
-    /// photo where it moves most.
+    /// Relative change of the inverse depth that moves the pixel's image by one pixel, in the photo
+    /// with the largest motion.
     step: f32,
     plane: Plane,
     score: f32,
@@ -230,7 +230,7 @@ impl<'a> Pixel<'a> {
         Self { stage, maps, column, row, patch, infinite, step: 1.0 / most, plane, score: UNSEEN }
     }
 
-    /// Tries the best plane of each group of pixels of the other color.
+    /// Tries the best plane of each group of pixels. They have the opposite color.
     #[inline(always)]
     fn take_from_nearby(&mut self, map: &PlaneMap) {
         let (column, row) = (self.column as i32, self.row as i32);
@@ -333,7 +333,7 @@ impl<'a> Pixel<'a> {
     }
 }
 
-/// The pixel and depth in the first photo of what the other photo's map has at (x, y), or None.
+/// The pixel and depth in the first photo of the surface that another photo's map has at (x, y), or None.
 #[inline(always)]
 pub fn there_and_back(pair: &Pair<'_>, map: &PlaneMap, x: f32, y: f32) -> Option<[f32; 3]> {
     let (column, row) = ((x + 0.5).floor(), (y + 0.5).floor());
