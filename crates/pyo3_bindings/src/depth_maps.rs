@@ -43,11 +43,8 @@ pub fn depth_maps<'py>(
         pixels.push((values, bytes.iter().map(|&byte| byte != 0).collect()));
     }
     let cameras = cameras(viewmats, intrinsics, &sizes)?;
-    let photos: Vec<GrayPhoto> = cameras
-        .into_iter()
-        .zip(pixels)
-        .map(|(camera, (gray, usable))| GrayPhoto { camera, gray, usable: Some(usable) })
-        .collect();
+    let photo = |(camera, (gray, usable))| GrayPhoto { camera, gray, usable: Some(usable) };
+    let photos: Vec<GrayPhoto> = cameras.into_iter().zip(pixels).map(photo).collect();
     let searches: Vec<Search> = searches
         .into_iter()
         .enumerate()

@@ -4,10 +4,10 @@ use super::DepthMap;
 use super::search::{PlaneMap, Stage, there_and_back};
 
 /// Minimum score of a pixel, and of one that a single map confirms.
-const MIN_SCORE: f32 = 0.4;
+const MIN_SCORE: f32 = 0.5;
 const MIN_SCORE_OF_ONE: f32 = 0.7;
 /// A map confirms a pixel whose image it maps back to within this many pixels and this fraction of depth.
-const MAX_OFF_PX: f32 = 0.7;
+const MAX_OFF_PX: f32 = 1.0;
 const MAX_OFF_FRACTION: f32 = 0.01;
 /// Distance in pixels that this fraction of the depth must move the pixel's image.
 const MIN_PARALLAX_PX: f32 = 0.05;
@@ -37,10 +37,8 @@ pub fn confirmed(stage: &Stage<'_>, k: usize, maps: &[PlaneMap]) -> DepthMap {
             };
             see += 1;
             let farther = plane.inverse_depth * (1.0 - MAX_OFF_FRACTION);
-            let parallax = pair
-                .there
-                .project(x, y, farther)
-                .map_or(0.0, |[x, y, _]| (x - column).hypot(y - row));
+            let moved = pair.there.project(x, y, farther);
+            let parallax = moved.map_or(0.0, |[x, y, _]| (x - column).hypot(y - row));
             let is_near = (back_x - x).hypot(back_y - y) <= MAX_OFF_PX;
             let relative = depth * plane.inverse_depth;
             if is_near && parallax > MIN_PARALLAX_PX && (relative - 1.0).abs() <= MAX_OFF_FRACTION {

@@ -111,11 +111,10 @@ fn check(photos: &[GrayPhoto], searches: &[Search]) -> Result<()> {
         photo.camera.validate()?;
         let pixels = photo.camera.width as usize * photo.camera.height as usize;
         let usable = photo.usable.as_ref().map_or(pixels, Vec::len);
-        if photo.gray.len() != pixels || usable != pixels {
-            return Err(Error::argument(format!("photos[{k}]"), "does not fit its camera's size"));
-        }
-        if !photo.gray.iter().all(|v| v.abs() <= 1.0) {
-            return Err(Error::argument(format!("photos[{k}]"), "has gray outside of 0..1"));
+        let in_range = photo.gray.iter().all(|v| v.abs() <= 1.0);
+        if photo.gray.len() != pixels || usable != pixels || !in_range {
+            let reason = "does not fit its camera's size, or has gray outside of 0..1";
+            return Err(Error::argument(format!("photos[{k}]"), reason));
         }
     }
     let mut searched = vec![false; photos.len()];
@@ -131,11 +130,9 @@ fn check(photos: &[GrayPhoto], searches: &[Search]) -> Result<()> {
             return bad("must compare with at most 8 photos, none of them its own");
         }
         let [near, far] = search.range;
-        if !(near.is_finite() && far > 0.0 && near > far) {
-            return bad("needs finite depths above 0, the nearest first");
-        }
-        if !search.seeds.as_flattened().iter().all(|v| v.is_finite()) {
-            return bad("has seeds that are not finite");
+        let is_finite = search.seeds.as_flattened().iter().all(|v| v.is_finite());
+        if !(is_finite && near.is_finite() && far > 0.0 && near > far) {
+            return bad("needs finite depths above 0, the nearest first, and finite seeds");
         }
     }
     Ok(())

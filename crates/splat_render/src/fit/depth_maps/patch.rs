@@ -11,7 +11,7 @@ const LANES: usize = 8;
 /// Samples count less by their distance and by their difference from the patch's center (bilateral
 /// weights), with these deviations in pixels and gray levels: they may be on another surface.
 const SPACE_PX: f32 = 5.0;
-const GRAY: f32 = 12.0;
+const GRAY: f32 = 16.0;
 /// Variance of gray levels (0..255) that noise has: patches of less have no texture and score near 0.
 const NOISE: f32 = 0.5;
 /// Fraction of the patch's weight that must be visible in another photo.

@@ -15,16 +15,17 @@ const NEAR: [[i32; 2]; 7] = [[0, 1], [1, 2], [-1, 2], [2, 3], [-2, 3], [3, 4], [
 const FAR: [[i32; 2]; 7] = [[0, 3], [0, 5], [0, 7], [0, 11], [0, 15], [0, 19], [0, 23]];
 /// Score that a depth loses which another photo's map contradicts, by the distance in pixels that a pixel
 /// is off after it was projected to that photo and, with its depth there, back.
-const CONTRADICTED: f32 = 0.7;
+const CONTRADICTED: f32 = 0.2;
 const MAX_OFF_PX: f32 = 3.0;
 /// Maximum random change of depths, in pixels that it moves a pixel's image in another photo.
 const MAX_CHANGE_PX: f32 = 4.0;
+/// Distance of the depths nearby that find the best one, in such pixels.
+const CLIMB_PX: f32 = 0.4;
 /// Maximum slope of planes: tangent of the angle between normal and ray.
 const MAX_SLOPE: f32 = 4.0;
 const MAX_RANDOM_SLOPE: f32 = 2.0;
 /// Planes within this many pixels in other photos and this slope are the same.
-const SAME_PX: f32 = 0.02;
-const SAME_SLOPE: f32 = 0.02;
+const SAME: f32 = 0.02;
 
 /// A plane through the ray of a pixel.
 #[derive(Debug, Clone, Copy, Default)]
@@ -264,6 +265,15 @@ impl<'a> Pixel<'a> {
             self.try_plane(Plane { inverse_depth, slope: self.plane.slope });
             self.try_plane(Plane { inverse_depth, slope });
         }
+        if !is_free {
+            // The top of the parabola through the score and the scores of two depths nearby.
+            let (plane, change) = (self.plane, CLIMB_PX * self.step);
+            let near =
+                |way| Plane { inverse_depth: plane.inverse_depth * (1.0 + way * change), ..plane };
+            let (less, more) = (self.score_of(near(-1.0)), self.score_of(near(1.0)));
+            let bend = (2.0 * self.score - less - more).max(1e-6);
+            self.try_plane(near((0.5 * (more - less) / bend).clamp(-1.5, 1.5)));
+        }
         for kind in 0..3 {
             let mut plane = self.plane;
             if kind != 1 {
@@ -285,11 +295,11 @@ impl<'a> Pixel<'a> {
     fn try_plane(&mut self, plane: Plane) {
         let [near, far] = self.stage.range;
         let Plane { inverse_depth, slope } = plane;
-        let change = (inverse_depth - self.plane.inverse_depth).abs();
+        let change = (inverse_depth - self.plane.inverse_depth).abs() / self.plane.inverse_depth;
         let turn = (slope[0] - self.plane.slope[0]).abs() + (slope[1] - self.plane.slope[1]).abs();
-        let is_same = change < SAME_PX * self.step * self.plane.inverse_depth && turn < SAME_SLOPE;
-        if is_same || !(far..=near).contains(&inverse_depth) || slope[0].hypot(slope[1]) > MAX_SLOPE
-        {
+        let is_same = change < SAME * self.step && turn < SAME;
+        let is_steep = slope[0].hypot(slope[1]) > MAX_SLOPE;
+        if is_same || is_steep || !(far..=near).contains(&inverse_depth) {
             return;
         }
         let score = self.score_of(plane);
