@@ -35,8 +35,8 @@ MAX_ANGLE_DEG = 60.0
 BEST_ANGLE_DEG = 15.0
 NEARER_DEG = 6.0
 FARTHER_DEG = 20.0
-#: Fits start from depth maps if photos have another one within this angle; further apart, depth maps
-#: leave too much open (strecha_fountain, 3 photos).
+#: Fits start from depth maps if photos have another one within this angle: further apart, depth
+#: maps leave too much open (strecha_fountain, 3 photos).
 NEIGHBOR_DEG = 40.0
 #: Number of photos to compare with, and the fraction of the scene that they must see.
 COMPARED_PHOTOS = 5
