@@ -9,14 +9,16 @@ over. A model that contradicts its photos is mapped again without the wrong matc
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from igsr.cameras.colmap.agreement import GOOD_FRACTION, agreeing, disagreeing
 from igsr.cameras.colmap.contradictions import (
     Pair,
     contradictions,
@@ -27,7 +29,11 @@ from igsr.cameras.colmap.contradictions import (
 )
 from igsr.cameras.colmap.database import image_id
 from igsr.cameras.colmap.mapping import Thresholds, extend, map_photos
-from igsr.cameras.colmap.matching import matched_along_lines, with_focal_lengths
+from igsr.cameras.colmap.matching import (
+    matched_along_lines,
+    with_focal_lengths,
+    with_other_focal_lengths,
+)
 from igsr.cameras.estimate import Progress
 
 #: COLMAP's thresholds first, then lower ones.
@@ -42,6 +48,9 @@ THRESHOLDS = (
 FIRST_DOUBTFUL = 3
 #: Maximum number of photos for retries.
 MAX_RETRY_PHOTOS = 60
+#: Initial focal lengths to try, in units of the longer side, of at most this many photos.
+FOCALS = (1.2, 0.7, 2.0)
+MAX_FOCAL_PHOTOS = 12
 #: Maximum fraction of missing photos to extend a model instead of mapping again.
 MAX_MISSING_FRACTION = 0.25
 #: Maximum number of times that matches are left out for one model.
@@ -89,7 +98,7 @@ def mapped(
     hopeless = set(range(count)) - {image - image_id(0) for pair in strengths for image in pair}
     source, database = matches, with_focal_lengths(matches, seed)
     best: Any | None = None
-    best_attempt = 0
+    best_attempt, most_agreeing = 0, -1
     guided: set[int] = set()
     few_missing = False
     for attempt, thresholds in enumerate(attempts):
@@ -108,7 +117,7 @@ def mapped(
             model = copy.deepcopy(best)
             extend(model, count, database, thresholds, seed, show)
         else:
-            model = map_photos(count, database, thresholds, seed, show)
+            model = _mapped_once(count, matches, database, thresholds, seed, show)
         for remapping in range(MAX_REMAPPINGS):
             wrong = _wrong_links(model, source, strengths, usable or {})
             if not wrong:
@@ -122,18 +131,66 @@ def mapped(
                 leave_out(file, wrong)
             database = with_focal_lengths(source, seed)
             # Mapped anew, because an extended model would keep its wrong cameras.
-            model = map_photos(count, database, thresholds, seed, show)
-        if model is not None and (best is None or model.num_reg_images() > best.num_reg_images()):
-            best, best_attempt = model, attempt
+            model = _mapped_once(count, matches, database, thresholds, seed, show)
+        if model is not None:
+            agreed = sum(agreeing(model, links(matches), matches).values())
+            if agreed > most_agreeing:
+                best, best_attempt, most_agreeing = model, attempt, agreed
         missing = _missing(best, count)
         if best is not None and len(strengths) < all_links:
             hopeless = _unlinked(best, strengths, count)
-        if best is not None and (count > MAX_RETRY_PHOTOS or missing <= hopeless):
+        if best is not None and (
+            count > MAX_RETRY_PHOTOS or (missing <= hopeless and _agrees(best, matches))
+        ):
             break
         if attempt == 0:
             few_missing = len(missing) <= MAX_MISSING_FRACTION * count
     show("mapping", count, count)
+    if best is not None and count <= MAX_RETRY_PHOTOS:
+        best = _without_disagreeing(best, matches)
     return Mapped(best, best_attempt >= FIRST_DOUBTFUL, all_links - len(strengths))
+
+
+def _mapped_once(
+    count: int, matches: Path, database: Path, thresholds: Thresholds, seed: int, show: Progress
+) -> Any | None:
+    """The model with which most matches agree, of those from several initial focal lengths.
+
+    More are tried only if the first model leaves out photos or contradicts matches.
+    """
+    best: Any | None = None
+    most = -1
+    starts: Iterable[Path] = [database]
+    if count <= MAX_FOCAL_PHOTOS:
+        starts = chain(starts, with_other_focal_lengths(database, FOCALS))
+    for start in starts:
+        model = map_photos(count, start, thresholds, seed, show)
+        if model is not None:
+            agreed = sum(agreeing(model, links(matches), matches).values())
+            if agreed > most:
+                best, most = model, agreed
+            if not _missing(model, count) and _agrees(model, matches):
+                break
+    return best
+
+
+def _agrees(model: Any, matches: Path) -> bool:
+    """Whether nearly all matches between a model's photos agree with it."""
+    verified = links(matches)
+    counts = agreeing(model, verified, matches)
+    total = sum(len(verified[pair]) for pair in counts)
+    return sum(counts.values()) >= GOOD_FRACTION * total
+
+
+def _without_disagreeing(model: Any, matches: Path) -> Any | None:
+    """The model without the photos whose matches disagree with it; None if fewer than two stay."""
+    verified = links(matches)
+    wrong = disagreeing(agreeing(model, verified, matches), verified)
+    if model.num_reg_images() - len(wrong) < 2:
+        return None
+    for image in wrong:
+        model.deregister_frame(model.images[image].frame_id)
+    return model
 
 
 def _wrong_links(

@@ -107,11 +107,13 @@ class Features:
 
 def comparable(xy: npt.ArrayLike, descriptors: npt.NDArray[np.uint8]) -> Features:
     """Prepare features at places [N, 2] in pixels, with descriptors uint8 [N, 128]."""
+    # Keypoints of other matchers follow those with descriptors.
+    xy = np.asarray(xy, dtype=np.float32).reshape(-1, 2)[: len(descriptors)]
     numbers = descriptors.astype(np.float32).reshape(-1, 128)
     squared = (numbers * numbers).sum(axis=1, keepdims=True)
     one = np.ones_like(squared)
     return Features(
-        np.asarray(xy, dtype=np.float32).reshape(-1, 2),
+        xy,
         np.hstack([2.0 * numbers, -squared, one]).astype(np.float32),
         np.hstack([numbers, one, -squared]).astype(np.float32),
     )

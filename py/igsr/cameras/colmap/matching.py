@@ -8,7 +8,7 @@ initial focal length is the most common failure.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Collection
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,18 +29,24 @@ from igsr.cameras.estimate import Progress
 
 #: Pairs between two progress reports.
 PAIRS_PER_REPORT = 8
+#: Begins the names of databases with estimated focal lengths.
+CALIBRATED = "calibrated_"
+#: Usual focal lengths, in units of the longer side (diagonal fields of view of 110 to 23 degrees).
+MIN_FOCAL = 0.4
+MAX_FOCAL = 3.0
 #: Maximum distance of a match to its epipolar line, pixels (COLMAP's).
 MAX_DISTANCE_PX = 4.0
 
 
-def matched(count: int, features: Path, seed: int, show: Progress) -> Path:
-    """Copy a database of features and add geometrically verified matches.
+def matched(count: int, features: Path, seed: int, show: Progress, *, verify: bool = True) -> Path:
+    """Copy a database of features and add matches.
 
     Args:
         count: number of photos.
         features: the database.
         seed: of the verification.
         show: called with "matching", done and total pairs.
+        verify: verify the matches geometrically.
 
     Returns:
         The new database in the same folder, with unchanged focal lengths.
@@ -51,6 +57,7 @@ def matched(count: int, features: Path, seed: int, show: Progress) -> Path:
     pairs = pairs_to_match(count, database)
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
+    matching.skip_geometric_verification = not verify
     # The views of a panorama have one center and different directions.
     matching.skip_image_pairs_in_same_frame = True
     verification = pycolmap.TwoViewGeometryOptions()
@@ -76,14 +83,50 @@ def matched(count: int, features: Path, seed: int, show: Progress) -> Path:
 
 
 def with_focal_lengths(matches: Path, seed: int) -> Path:
-    """Copy a database of matches and estimate focal lengths from all its pairs."""
+    """Copy a database of matches and estimate focal lengths from all its pairs.
+
+    Where pairs show little but a plane, the estimate may be far off. Focal lengths that no usual
+    lens has stay as they were: the mapper starts from twice the right one without harm.
+    """
     pycolmap = load_pycolmap()
-    database = matches.with_name(f"calibrated_{matches.name}")
+    database = matches.with_name(f"{CALIBRATED}{matches.name}")
     shutil.copyfile(matches, database)
     calibration = pycolmap.ViewGraphCalibrationOptions()
     calibration.random_seed = seed
+    with pycolmap.Database.open(database) as opened:
+        before = {camera.camera_id: camera for camera in opened.read_all_cameras()}
     pycolmap.calibrate_view_graph(database, calibration)
+    with pycolmap.Database.open(database) as opened:
+        for camera in opened.read_all_cameras():
+            focal = camera.params[0] / max(camera.width, camera.height)
+            if not MIN_FOCAL <= focal <= MAX_FOCAL:
+                opened.update_camera(before[camera.camera_id])
     return database
+
+
+def with_other_focal_lengths(database: Path, focals: Sequence[float]) -> Iterator[Path]:
+    """Copy a database with other focal lengths for cameras without a prior one.
+
+    Args:
+        database: from ``with_focal_lengths``.
+        focals: in units of the longer side; a copy is made for each if it changes a camera.
+    """
+    pycolmap = load_pycolmap()
+    with pycolmap.Database.open(database.with_name(database.name[len(CALIBRATED) :])) as opened:
+        known = {c.camera_id for c in opened.read_all_cameras() if c.has_prior_focal_length}
+    for focal in focals:
+        copied = database.with_name(f"focal_{focal}_{database.name}")
+        shutil.copyfile(database, copied)
+        changed = False
+        with pycolmap.Database.open(copied) as opened:
+            for camera in opened.read_all_cameras():
+                length = focal * max(camera.width, camera.height)
+                if camera.camera_id not in known and length != camera.params[0]:
+                    camera.params = [length, *camera.params[1:]]
+                    opened.update_camera(camera)
+                    changed = True
+        if changed:
+            yield copied
 
 
 def with_matches(matches: Path) -> set[int]:
@@ -130,8 +173,15 @@ def matched_along_lines(matches: Path, wanted: Collection[int], show: Progress) 
                 features[image] = comparable(
                     opened.read_keypoints(image)[:, :2], opened.read_descriptors(image).data
                 )
-            inliers = guided_matches(features[a], features[b], constraint)
-            if len(inliers) > len(geometry.inlier_matches):
+            of_sift = [len(features[a].xy), len(features[b].xy)]
+            before = geometry.inlier_matches
+            inliers = np.vstack(
+                [
+                    guided_matches(features[a], features[b], constraint),
+                    before[(before >= of_sift).any(axis=1)],
+                ]
+            )
+            if len(inliers) > len(before):
                 geometry.inlier_matches = inliers
                 opened.update_two_view_geometry(a, b, geometry)
                 gained = True
