@@ -8,6 +8,7 @@ same place: then matches that the mapper ignored disagree with the model.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +26,24 @@ MAX_DISTANCE_PX = 4.0
 MIN_ANGLE = 0.5
 #: Minimum fraction of a model's matches that agree with it for the search to end.
 GOOD_FRACTION = 0.9
-#: A photo is removed if at most this fraction of its matches with the others agree.
-MAX_WRONG_FRACTION = 0.5
+#: Of the learned features that two photos should both show, at least this fraction is matched from
+#: one direction. It falls with the angle. In correct models it was at least 1.7 times as high.
+SHARED_FRACTION = 0.25
+FALLING_ANGLE = 15.0
+#: Pairs within this angle, degrees, and this ratio of scales are checked.
+MAX_CLOSE_ANGLE = 20.0
+MAX_ZOOM = 1.5
+#: Minimum number of these features.
+MIN_SHARED = 100
+#: Groups of photos belong together if at least this fraction of the matches between them agree.
+JOINING_FRACTION = 0.7
+#: The same if two pairs without a common photo agree: each with this many matches, and this part
+#: of its matches.
+JOINING_FRACTION_OF_TWO = 0.35
+MIN_SURE = 30
+SURE = 0.85
+#: A photo stays if at least this fraction of all its matches agrees with photos that stay.
+MIN_OWN_FRACTION = 0.5
 
 
 def agreeing(
@@ -76,26 +93,127 @@ def _agree(one: Any, other: Any, first: Float64, second: Float64) -> npt.NDArray
     return agree
 
 
-def disagreeing(counts: Mapping[Pair, int], matches: Mapping[Pair, Any]) -> set[int]:
-    """Photos whose matches disagree with a model, the worst first until the others agree.
+def consistent_part(counts: Mapping[Pair, int], matches: Mapping[Pair, Any]) -> set[int]:
+    """Find the largest part of a model whose photos agree with each other.
+
+    Photos are joined, most agreeing matches first, unless the matches between the two groups
+    mostly disagree with the model: then a few look-alike matches hold wrong parts together. Two
+    pairs of four photos that agree weigh more, since wrong pairs seldom agree with each other.
+    Photos that have most of their matches with others, left out, are left out too.
 
     Args:
-        counts: as from ``agreeing``.
-        matches: of the pairs.
+        counts: of the pairs of placed photos, as from ``agreeing``.
+        matches: of all pairs.
 
     Returns:
         COLMAP's image ids.
     """
-    removed: set[int] = set()
+    groups = {frozenset([photo]) for pair in counts for photo in pair}
     while True:
-        agreed: dict[int, int] = {}
-        verified: dict[int, int] = {}
-        for pair, count in counts.items():
-            if removed.isdisjoint(pair):
-                for photo in pair:
-                    agreed[photo] = agreed.get(photo, 0) + count
-                    verified[photo] = verified.get(photo, 0) + len(matches[pair])
-        worst = min(verified, key=lambda n: (agreed[n] / verified[n], n), default=None)
-        if worst is None or agreed[worst] > MAX_WRONG_FRACTION * verified[worst]:
-            return removed
-        removed.add(worst)
+        best, most = None, 0
+        for one, other in combinations(sorted(groups, key=min), 2):
+            between = [
+                pair
+                for pair in counts
+                if (pair[0] in one and pair[1] in other) or (pair[0] in other and pair[1] in one)
+            ]
+            agreed = sum(counts[pair] for pair in between)
+            verified = sum(len(matches[pair]) for pair in between)
+            sure = [p for p in between if counts[p] >= max(MIN_SURE, SURE * len(matches[p]))]
+            apart = any(set(p).isdisjoint(q) for p, q in combinations(sure, 2))
+            fraction = JOINING_FRACTION_OF_TWO if apart else JOINING_FRACTION
+            if agreed > most and agreed >= fraction * verified:
+                best, most = (one, other), agreed
+        if best is None:
+            break
+        groups = (groups - set(best)) | {best[0] | best[1]}
+    inside = {
+        group: sum(counts[pair] for pair in counts if group.issuperset(pair)) for group in groups
+    }
+    part = set(max(inside, key=lambda group: (inside[group], -min(group)), default=()))
+    while part:
+        share = {
+            photo: sum(counts[pair] for pair in counts if photo in pair and part.issuperset(pair))
+            / sum(len(matches[pair]) for pair in matches if photo in pair)
+            for photo in part
+        }
+        worst = min(share, key=lambda photo: (share[photo], photo))
+        if share[worst] >= MIN_OWN_FRACTION:
+            break
+        part.remove(worst)
+    return part
+
+
+def missing_matches(
+    model: Any, matches: Mapping[Pair, npt.NDArray[np.uint32]], database: Path
+) -> set[Pair]:
+    """Find pairs of a model's photos with too few learned matches for their cameras.
+
+    Photos of one side of an object from nearly one direction share most of their learned features;
+    similar sides share few of them. So such a pair is at a wrong place. Photos by other matchers,
+    which find fewer matches, are not checked.
+
+    Args:
+        model: pycolmap's reconstruction.
+        matches: verified, as from ``links``.
+        database: of the features. Those without descriptors are learned.
+    """
+    pycolmap = load_pycolmap()
+    numbers = sorted(model.reg_image_ids())
+    features: dict[int, Float64] = {}  # learned, pixels
+    first: dict[int, int] = {}
+    with pycolmap.Database.open(database) as opened:
+        for n in numbers:
+            count = opened.num_descriptors_for_image(n)
+            features[n], first[n] = opened.read_keypoints(n)[count:, :2].astype(np.float64), count
+    depth: dict[int, float] = {}
+    for n in numbers:
+        seen = [p.point3D_id for p in model.images[n].get_observation_points2D()]
+        if seen and len(features[n]):
+            pose = model.images[n].cam_from_world().matrix()
+            xyz = np.array([model.points3D[point].xyz for point in seen])
+            depth[n] = float(np.median(xyz @ pose[2, :3] + pose[2, 3]))
+    missing: set[Pair] = set()
+    for i, a in enumerate(numbers):
+        for b in numbers[i + 1 :]:
+            if a not in depth or b not in depth:
+                continue
+            one, other = model.images[a], model.images[b]
+            angle = _angle(one, other, depth[a])
+            zoom = depth[a] * other.camera.mean_focal_length()
+            zoom /= depth[b] * one.camera.mean_focal_length()
+            if angle > MAX_CLOSE_ANGLE or not 1.0 / MAX_ZOOM < zoom < MAX_ZOOM:
+                continue
+            should = min(
+                _shown(one, other, features[a], depth[a]),
+                _shown(other, one, features[b], depth[b]),
+            )
+            shared = matches.get((a, b), np.zeros((0, 2), dtype=np.uint32))
+            learned = np.count_nonzero(shared[:, 0] >= first[a])
+            wanted = SHARED_FRACTION * np.exp(-angle / FALLING_ANGLE)
+            if should >= MIN_SHARED and learned < wanted * should:
+                missing.add((a, b))
+    return missing
+
+
+def _angle(one: Any, other: Any, depth: float) -> float:
+    """The angle between two cameras, degrees: of rotation, or between their rays to a point."""
+    relative = other.cam_from_world() * one.cam_from_world().inverse()
+    turned = np.arccos(np.clip(0.5 * (np.trace(relative.rotation.matrix()) - 1.0), -1.0, 1.0))
+    middle = one.cam_from_world().inverse() * np.array([0.0, 0.0, depth])
+    rays = [middle - image.projection_center() for image in (one, other)]
+    rays = [ray / max(float(np.linalg.norm(ray)), 1e-12) for ray in rays]
+    return float(np.degrees(max(turned, np.arccos(np.clip(rays[0] @ rays[1], -1.0, 1.0)))))
+
+
+def _shown(one: Any, other: Any, pixels: Float64, depth: float) -> int:
+    """The number of pixels [N, 2] of an image that another shows, if all have one depth."""
+    local = np.pad(one.camera.cam_from_img(pixels), ((0, 0), (0, 1)), constant_values=1.0) * depth
+    pose = (other.cam_from_world() * one.cam_from_world().inverse()).matrix()
+    seen = local @ pose[:, :3].T + pose[:, 3]
+    camera = other.camera
+    with np.errstate(all="ignore"):
+        x = seen[:, 0] / seen[:, 2] * camera.focal_length_x + camera.principal_point_x
+        y = seen[:, 1] / seen[:, 2] * camera.focal_length_y + camera.principal_point_y
+    inside = (seen[:, 2] > 0.0) & (x > 0.0) & (y > 0.0) & (x < camera.width) & (y < camera.height)
+    return int(np.count_nonzero(inside))

@@ -27,7 +27,12 @@ WEIGHTS = {
     "aliked_lightglue.pth": "d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503",
 }
 #: Maximum number of features of a photo. Time of a pair grows with its square.
-MAX_FEATURES = 1024
+MAX_FEATURES = 2048
+#: Number of the best features of a photo for the first matching of a pair, and the numbers of
+#: matches with which a pair is matched again with all features: fewer are by chance.
+BEST_FEATURES = 1024
+MIN_MATCHES = 10
+MAX_WEAK_MATCHES = 150
 #: Minimum score of a feature: low, so that photos with little texture have features.
 MIN_SCORE = 0.01
 #: Longest side at which features are found, pixels; bounds memory and time.
@@ -94,7 +99,17 @@ class Aliked:
         )
 
     def matches(self, first: PhotoFeatures, second: PhotoFeatures) -> npt.NDArray[np.uint32]:
-        """Return pairs of feature indices [M, 2]; no feature is in two pairs."""
+        """Return pairs of feature indices [M, 2]; no feature is in two pairs.
+
+        Most pairs of photos need only their best features; weak pairs are matched with all.
+        """
+        best = [one.kept(np.arange(len(one.xy)) < BEST_FEATURES) for one in (first, second)]
+        matches = self._matches(*best)
+        if MIN_MATCHES <= len(matches) < MAX_WEAK_MATCHES:
+            return self._matches(first, second)
+        return matches
+
+    def _matches(self, first: PhotoFeatures, second: PhotoFeatures) -> npt.NDArray[np.uint32]:
         with self._torch.inference_mode():
             found = self._matcher({"image0": self._batch(first), "image1": self._batch(second)})
         matches: npt.NDArray[np.uint32] = found["matches"][0].cpu().numpy().astype(np.uint32)

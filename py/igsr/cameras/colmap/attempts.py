@@ -18,7 +18,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from igsr.cameras.colmap.agreement import GOOD_FRACTION, agreeing, disagreeing
+from igsr.cameras.colmap.agreement import (
+    GOOD_FRACTION,
+    agreeing,
+    consistent_part,
+    missing_matches,
+)
 from igsr.cameras.colmap.contradictions import (
     Pair,
     contradictions,
@@ -30,9 +35,11 @@ from igsr.cameras.colmap.contradictions import (
 from igsr.cameras.colmap.database import image_id
 from igsr.cameras.colmap.mapping import Thresholds, extend, map_photos
 from igsr.cameras.colmap.matching import (
+    has_usual_focals,
     matched_along_lines,
     with_focal_lengths,
     with_other_focal_lengths,
+    with_strongest_links,
 )
 from igsr.cameras.estimate import Progress
 
@@ -48,9 +55,9 @@ THRESHOLDS = (
 FIRST_DOUBTFUL = 3
 #: Maximum number of photos for retries.
 MAX_RETRY_PHOTOS = 60
-#: Initial focal lengths to try, in units of the longer side, of at most this many photos.
+#: Initial focal lengths to try, in units of the longer side, if there are at most this many photos.
 FOCALS = (1.2, 0.7, 2.0)
-MAX_FOCAL_PHOTOS = 12
+MAX_TRIAL_PHOTOS = 12
 #: Maximum fraction of missing photos to extend a model instead of mapping again.
 MAX_MISSING_FRACTION = 0.25
 #: Maximum number of times that matches are left out for one model.
@@ -102,7 +109,7 @@ def mapped(
     guided: set[int] = set()
     few_missing = False
     for attempt, thresholds in enumerate(attempts):
-        extending = few_missing and attempt < FIRST_DOUBTFUL
+        extending = few_missing and attempt < FIRST_DOUBTFUL and _agrees(best, matches)
         if thresholds.guided_matching:
             wanted = _missing(best, count) if extending else set(range(count))
             if not wanted <= guided:
@@ -119,7 +126,7 @@ def mapped(
         else:
             model = _mapped_once(count, matches, database, thresholds, seed, show)
         for remapping in range(MAX_REMAPPINGS):
-            wrong = _wrong_links(model, source, strengths, usable or {})
+            wrong = _wrong_links(model, matches, source, strengths, usable or {})
             if not wrong:
                 break
             if attempt >= FIRST_DOUBTFUL or remapping + 1 == MAX_REMAPPINGS:
@@ -131,6 +138,7 @@ def mapped(
                 leave_out(file, wrong)
             database = with_focal_lengths(source, seed)
             # Mapped anew, because an extended model would keep its wrong cameras.
+            best, most_agreeing = None, -1
             model = _mapped_once(count, matches, database, thresholds, seed, show)
         if model is not None:
             agreed = sum(agreeing(model, links(matches), matches).values())
@@ -139,9 +147,9 @@ def mapped(
         missing = _missing(best, count)
         if best is not None and len(strengths) < all_links:
             hopeless = _unlinked(best, strengths, count)
-        if best is not None and (
-            count > MAX_RETRY_PHOTOS or (missing <= hopeless and _agrees(best, matches))
-        ):
+        if best is not None and count > MAX_RETRY_PHOTOS:
+            break
+        if missing <= hopeless and _agrees(best, matches):
             break
         if attempt == 0:
             few_missing = len(missing) <= MAX_MISSING_FRACTION * count
@@ -154,18 +162,21 @@ def mapped(
 def _mapped_once(
     count: int, matches: Path, database: Path, thresholds: Thresholds, seed: int, show: Progress
 ) -> Any | None:
-    """The model with which most matches agree, of those from several initial focal lengths.
+    """The model with which most matches agree.
 
-    More are tried only if the first model leaves out photos or contradicts matches.
+    If the first leaves out photos or contradicts matches, models of only the strongest links and of
+    other initial focal lengths are tried.
     """
     best: Any | None = None
     most = -1
     starts: Iterable[Path] = [database]
-    if count <= MAX_FOCAL_PHOTOS:
-        starts = chain(starts, with_other_focal_lengths(database, FOCALS))
+    if count <= MAX_TRIAL_PHOTOS:
+        starts = chain(
+            starts, with_strongest_links(database), with_other_focal_lengths(database, FOCALS)
+        )
     for start in starts:
         model = map_photos(count, start, thresholds, seed, show)
-        if model is not None:
+        if model is not None and has_usual_focals(model, start):
             agreed = sum(agreeing(model, links(matches), matches).values())
             if agreed > most:
                 best, most = model, agreed
@@ -174,8 +185,10 @@ def _mapped_once(
     return best
 
 
-def _agrees(model: Any, matches: Path) -> bool:
+def _agrees(model: Any | None, matches: Path) -> bool:
     """Whether nearly all matches between a model's photos agree with it."""
+    if model is None:
+        return False
     verified = links(matches)
     counts = agreeing(model, verified, matches)
     total = sum(len(verified[pair]) for pair in counts)
@@ -183,18 +196,19 @@ def _agrees(model: Any, matches: Path) -> bool:
 
 
 def _without_disagreeing(model: Any, matches: Path) -> Any | None:
-    """The model without the photos whose matches disagree with it; None if fewer than two stay."""
+    """The largest part of a model that agrees with the matches; None if fewer than two photos."""
     verified = links(matches)
-    wrong = disagreeing(agreeing(model, verified, matches), verified)
-    if model.num_reg_images() - len(wrong) < 2:
+    part = consistent_part(agreeing(model, verified, matches), verified)
+    if len(part) < 2:
         return None
-    for image in wrong:
+    for image in sorted(set(model.reg_image_ids()) - part):
         model.deregister_frame(model.images[image].frame_id)
     return model
 
 
 def _wrong_links(
     model: Any | None,
+    matches: Path,
     source: Path,
     strengths: dict[Pair, int],
     usable: Mapping[int, npt.NDArray[np.bool_]],
@@ -202,7 +216,11 @@ def _wrong_links(
     """Pairs of photos whose matches make a model contradict its photos."""
     if model is None or model.num_reg_images() > MAX_RETRY_PHOTOS:
         return set()
-    return links_between_parts(strengths, contradictions(model, links(source), usable))
+    return links_between_parts(
+        strengths,
+        contradictions(model, links(source), usable),
+        missing_matches(model, links(matches), matches),
+    )
 
 
 def _unlinked(model: Any, strengths: dict[Pair, int], count: int) -> set[int]:

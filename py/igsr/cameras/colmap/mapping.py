@@ -11,6 +11,8 @@ from igsr._internal.load_pycolmap import load_pycolmap
 from igsr.cameras.colmap.database import known_cameras
 from igsr.cameras.estimate import Progress
 
+#: Minimum number of photos to find lens distortion.
+MIN_DISTORTION_PHOTOS = 5
 #: Lens distortion is dropped if the squared error grows by at most this factor: photos that are not
 #: resampled stay sharp, and from few photos distortion is often a wrong focal length.
 MAX_ERROR_FACTOR = 1.02
@@ -94,8 +96,10 @@ def mapping_options(count: int, thresholds: Thresholds, seed: int, database: Pat
     options.mapper.filter_min_tri_angle = thresholds.filter_min_tri_angle
     options.triangulation.ignore_two_view_tracks = thresholds.ignore_two_view_tracks
     options.triangulation.min_angle = thresholds.filter_min_tri_angle
-    # Two photos cannot improve the focal length of EXIF or of the fundamental matrix.
-    options.ba_refine_focal_length = options.ba_refine_extra_params = count > 2
+    # Two photos cannot improve the focal length of EXIF or of the fundamental matrix; a few more do
+    # not tell lens distortion from focal length.
+    options.ba_refine_focal_length = count > 2
+    options.ba_refine_extra_params = count >= MIN_DISTORTION_PHOTOS
     options.constant_cameras = known_cameras(database)
     options.ba_refine_sensor_from_rig = False
     return options

@@ -29,6 +29,8 @@ from igsr.cameras.estimate import Progress
 
 #: Pairs between two progress reports.
 PAIRS_PER_REPORT = 8
+#: Number of links of each photo that are kept as its strongest.
+STRONGEST_LINKS = 2
 #: Begins the names of databases with estimated focal lengths.
 CALIBRATED = "calibrated_"
 #: Usual focal lengths, in units of the longer side (diagonal fields of view of 110 to 23 degrees).
@@ -112,8 +114,7 @@ def with_other_focal_lengths(database: Path, focals: Sequence[float]) -> Iterato
         focals: in units of the longer side; a copy is made for each if it changes a camera.
     """
     pycolmap = load_pycolmap()
-    with pycolmap.Database.open(database.with_name(database.name[len(CALIBRATED) :])) as opened:
-        known = {c.camera_id for c in opened.read_all_cameras() if c.has_prior_focal_length}
+    known = _known_focals(database)
     for focal in focals:
         copied = database.with_name(f"focal_{focal}_{database.name}")
         shutil.copyfile(database, copied)
@@ -127,6 +128,58 @@ def with_other_focal_lengths(database: Path, focals: Sequence[float]) -> Iterato
                     changed = True
         if changed:
             yield copied
+
+
+def with_strongest_links(database: Path) -> Iterator[Path]:
+    """Copy a database with only the strongest links of each photo, if it has others.
+
+    Sides of an object that look alike have fewer matches than neighboring photos.
+    """
+    pycolmap = load_pycolmap()
+    with pycolmap.Database.open(database) as opened:
+        ids, geometries = opened.read_two_view_geometries()
+        numbers = sorted(zip(ids, map(_inliers, geometries), strict=True), key=lambda x: -x[1])
+        used: dict[int, int] = {}
+        weak = []
+        for pair, _ in numbers:
+            images = pycolmap.pair_id_to_image_pair(pair)
+            if min(used.get(image, 0) for image in images) >= STRONGEST_LINKS:
+                weak.append(images)
+            for image in images:
+                used[image] = used.get(image, 0) + 1
+    if not weak:
+        return
+    copied = database.with_name(f"strongest_{database.name}")
+    shutil.copyfile(database, copied)
+    with pycolmap.Database.open(copied) as opened:
+        for images in weak:
+            opened.delete_two_view_geometry(*images)
+    yield copied
+
+
+def _inliers(geometry: Any) -> int:
+    return len(geometry.inlier_matches)
+
+
+def has_usual_focals(model: Any, database: Path) -> bool:
+    """Whether a model's focal lengths are usual ones, except those of EXIF.
+
+    A few photos from far away look alike for all long focal lengths; the mapper may end at any.
+    """
+    known = _known_focals(database)
+    return all(
+        camera.camera_id in known
+        or MIN_FOCAL <= camera.mean_focal_length() / max(camera.width, camera.height) <= MAX_FOCAL
+        for camera in model.cameras.values()
+    )
+
+
+def _known_focals(database: Path) -> set[int]:
+    """Ids of cameras whose focal length was known before ``with_focal_lengths``."""
+    pycolmap = load_pycolmap()
+    source = database.with_name(database.name.partition(CALIBRATED)[2])
+    with pycolmap.Database.open(source) as opened:
+        return {c.camera_id for c in opened.read_all_cameras() if c.has_prior_focal_length}
 
 
 def with_matches(matches: Path) -> set[int]:
