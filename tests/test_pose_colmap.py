@@ -100,8 +100,30 @@ def test_several_processes_find_the_same_features(photos, found, monkeypatch):
     assert matrices(again.cameras) == matrices(found.cameras)
     np.testing.assert_array_equal(again.points.xyz, found.points.xyz)
     monkeypatch.setattr(sys, "executable", "/bin/false")
-    with pytest.raises(igsr.IgsrError, match="Finding features ended early"):
+    with pytest.raises(igsr.IgsrError, match="Finding cameras ended early"):
         Colmap()(photos, seed=3)
+
+
+def test_of_many_features_the_largest_are_kept(photos, monkeypatch):
+    gray = features._gray(photos[0])
+    everything, descriptors = features._sift(gray)
+    monkeypatch.setattr(features, "MAX_FEATURES", 100)
+    largest, kept = features._sift(gray)
+    areas = features.feature_areas(everything)
+    rows = areas >= np.sort(areas)[-100]
+    np.testing.assert_array_equal(largest, everything[rows])
+    np.testing.assert_array_equal(kept, descriptors[rows])
+
+
+def test_photos_with_enough_features_are_not_enlarged(photos, monkeypatch):
+    gray = features._gray(photos[0])
+    enlarged, _ = features._sift(gray)
+    monkeypatch.setattr(features, "MIN_ONCE_PX", 0)
+    np.testing.assert_array_equal(features._sift(gray)[0], enlarged)
+    monkeypatch.setattr(features, "ENOUGH_FEATURES", 50)
+    once, _ = features._sift(gray)
+    assert 50 <= len(once) < len(enlarged)
+    assert features.feature_areas(once).min() > 2.0 * features.feature_areas(enlarged).min()
 
 
 def test_lens_distortion_is_estimated_and_undone():

@@ -2,16 +2,15 @@
 
 If COLMAP's own thresholds leave out few photos, more matches are searched for these, and the model
 is extended. If they leave out many, more matches are searched for all pairs, and mapping starts
-over. A model that contradicts its photos is mapped again without the wrong matches
-(``contradictions``).
+over, as it does with the first thresholds that may give a wrong model. A model that contradicts its
+photos is mapped again without the wrong matches (``contradictions``).
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -33,13 +32,12 @@ from igsr.cameras.colmap.contradictions import (
     parts,
 )
 from igsr.cameras.colmap.database import image_id
-from igsr.cameras.colmap.mapping import Thresholds, extend, map_photos
+from igsr.cameras.colmap.mapping import Thresholds, extend, map_globally, map_photos
 from igsr.cameras.colmap.matching import (
     has_usual_focals,
     matched_along_lines,
     with_focal_lengths,
     with_other_focal_lengths,
-    with_strongest_links,
 )
 from igsr.cameras.estimate import Progress
 
@@ -109,7 +107,7 @@ def mapped(
     guided: set[int] = set()
     few_missing = False
     for attempt, thresholds in enumerate(attempts):
-        extending = few_missing and attempt < FIRST_DOUBTFUL and _agrees(best, matches)
+        extending = few_missing and attempt != FIRST_DOUBTFUL and _agrees(best, matches)
         if thresholds.guided_matching:
             wanted = _missing(best, count) if extending else set(range(count))
             if not wanted <= guided:
@@ -162,27 +160,29 @@ def mapped(
 def _mapped_once(
     count: int, matches: Path, database: Path, thresholds: Thresholds, seed: int, show: Progress
 ) -> Any | None:
-    """The model with which most matches agree.
-
-    If the first leaves out photos or contradicts matches, models of only the strongest links and of
-    other initial focal lengths are tried.
-    """
+    """The model with which most matches agree, until one of all photos does."""
     best: Any | None = None
     most = -1
-    starts: Iterable[Path] = [database]
-    if count <= MAX_TRIAL_PHOTOS:
-        starts = chain(
-            starts, with_strongest_links(database), with_other_focal_lengths(database, FOCALS)
-        )
-    for start in starts:
-        model = map_photos(count, start, thresholds, seed, show)
-        if model is not None and has_usual_focals(model, start):
+    for model in _models(count, database, thresholds, seed, show):
+        if model is not None and has_usual_focals(model, database):
             agreed = sum(agreeing(model, links(matches), matches).values())
             if agreed > most:
                 best, most = model, agreed
             if not _missing(model, count) and _agrees(model, matches):
                 break
     return best
+
+
+def _models(
+    count: int, database: Path, thresholds: Thresholds, seed: int, show: Progress
+) -> Iterator[Any | None]:
+    """Models of a database: of the incremental mapper, the global one, and other focal lengths."""
+    yield map_photos(count, database, thresholds, seed, show)
+    if count <= MAX_TRIAL_PHOTOS:
+        if not thresholds.ignore_two_view_tracks:
+            yield map_globally(database, thresholds, seed)
+        for start in with_other_focal_lengths(database, FOCALS):
+            yield map_photos(count, start, thresholds, seed, show)
 
 
 def _agrees(model: Any | None, matches: Path) -> bool:

@@ -9,33 +9,38 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Collection, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from igsr._internal.load_pycolmap import load_pycolmap
 from igsr.cameras.colmap.database import image_id, photo_file
 from igsr.cameras.colmap.guided_matching import (
     Constraint,
     EpipolarLine,
-    Features,
     Plane,
     comparable,
     guided_matches,
 )
 from igsr.cameras.colmap.pairs import in_tiles, pairs_to_match
+from igsr.cameras.colmap.processes import process_count, processes
 from igsr.cameras.estimate import Progress
+
+#: Features of a photo: places [N, 2] in pixels, and descriptors uint8 [N, 128].
+Described: TypeAlias = tuple[npt.NDArray[np.float32], npt.NDArray[np.uint8]]
 
 #: Pairs between two progress reports.
 PAIRS_PER_REPORT = 8
-#: Number of links of each photo that are kept as its strongest.
-STRONGEST_LINKS = 2
 #: Begins the names of databases with estimated focal lengths.
 CALIBRATED = "calibrated_"
 #: Usual focal lengths, in units of the longer side (diagonal fields of view of 110 to 23 degrees).
 MIN_FOCAL = 0.4
 MAX_FOCAL = 3.0
+#: With fewer pairs, one process is faster.
+MIN_PARALLEL_PAIRS = 16
 #: Maximum distance of a match to its epipolar line, pixels (COLMAP's).
 MAX_DISTANCE_PX = 4.0
 
@@ -130,37 +135,6 @@ def with_other_focal_lengths(database: Path, focals: Sequence[float]) -> Iterato
             yield copied
 
 
-def with_strongest_links(database: Path) -> Iterator[Path]:
-    """Copy a database with only the strongest links of each photo, if it has others.
-
-    Sides of an object that look alike have fewer matches than neighboring photos.
-    """
-    pycolmap = load_pycolmap()
-    with pycolmap.Database.open(database) as opened:
-        ids, geometries = opened.read_two_view_geometries()
-        numbers = sorted(zip(ids, map(_inliers, geometries), strict=True), key=lambda x: -x[1])
-        used: dict[int, int] = {}
-        weak = []
-        for pair, _ in numbers:
-            images = pycolmap.pair_id_to_image_pair(pair)
-            if min(used.get(image, 0) for image in images) >= STRONGEST_LINKS:
-                weak.append(images)
-            for image in images:
-                used[image] = used.get(image, 0) + 1
-    if not weak:
-        return
-    copied = database.with_name(f"strongest_{database.name}")
-    shutil.copyfile(database, copied)
-    with pycolmap.Database.open(copied) as opened:
-        for images in weak:
-            opened.delete_two_view_geometry(*images)
-    yield copied
-
-
-def _inliers(geometry: Any) -> int:
-    return len(geometry.inlier_matches)
-
-
 def has_usual_focals(model: Any, database: Path) -> bool:
     """Whether a model's focal lengths are usual ones, except those of EXIF.
 
@@ -218,30 +192,39 @@ def matched_along_lines(matches: Path, wanted: Collection[int], show: Progress) 
             constraint = _constraint(geometry)
             if constraint is not None and (a in images or b in images):
                 pairs.append((a, b, geometry, constraint))
-        features: dict[int, Features] = {}
-        for done, (a, b, geometry, constraint) in enumerate(pairs):
+        features: dict[int, Described] = {}
+        for image in {image for pair in pairs for image in pair[:2]}:
+            descriptors = np.asarray(opened.read_descriptors(image).data)
+            features[image] = opened.read_keypoints(image)[:, :2], descriptors
+        found = _guided([(features[a], features[b], rule) for a, b, _, rule in pairs])
+        for done, ((a, b, geometry, _), inliers) in enumerate(zip(pairs, found, strict=True)):
             if done % PAIRS_PER_REPORT == 0:
                 show("matching", done, len(pairs))
-            for image in {a, b} - features.keys():
-                features[image] = comparable(
-                    opened.read_keypoints(image)[:, :2], opened.read_descriptors(image).data
-                )
-            of_sift = [len(features[a].xy), len(features[b].xy)]
-            before = geometry.inlier_matches
-            inliers = np.vstack(
-                [
-                    guided_matches(features[a], features[b], constraint),
-                    before[(before >= of_sift).any(axis=1)],
-                ]
-            )
-            if len(inliers) > len(before):
+            counts = [len(features[image][1]) for image in (a, b)]
+            others = (geometry.inlier_matches >= counts).any(axis=1)
+            inliers = np.vstack([inliers, geometry.inlier_matches[others]])
+            if len(inliers) > len(geometry.inlier_matches):
                 geometry.inlier_matches = inliers
                 opened.update_two_view_geometry(a, b, geometry)
                 gained = True
-            # Bounds memory: pairs are ordered by their first photo.
-            features = {image: kept for image, kept in features.items() if image == a}
         show("matching", len(pairs), len(pairs))
     return database if gained else None
+
+
+def _guided(
+    pairs: Sequence[tuple[Described, Described, Constraint]],
+) -> Iterator[npt.NDArray[np.uint32]]:
+    """The guided matches of each pair, in order."""
+    count = process_count()
+    if count == 1 or len(pairs) < MIN_PARALLEL_PAIRS:
+        yield from (_matches(*pair) for pair in pairs)
+        return
+    with processes(count) as call, ThreadPoolExecutor(count) as pool:
+        yield from pool.map(lambda pair: call(_matches, *pair), pairs)
+
+
+def _matches(first: Described, second: Described, constraint: Constraint) -> npt.NDArray[np.uint32]:
+    return guided_matches(comparable(*first), comparable(*second), constraint)
 
 
 def _constraint(geometry: Any) -> Constraint | None:

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from igsr._internal.load_pycolmap import load_pycolmap
 from igsr.cameras.colmap.database import photo_file
+from igsr.cameras.colmap.features import feature_areas
 
 #: Maximum number of photos for matching every pair.
 MAX_EXHAUSTIVE_PHOTOS = 60
@@ -90,10 +91,8 @@ def largest_features(count: int, database: Path) -> list[npt.NDArray[np.float32]
                 continue
             keypoints = opened.read_keypoints(image_id)
             descriptors = opened.read_descriptors(image_id).data.astype(np.float32)
-            # The determinant of a feature's affine shape is the square of its size.
-            size = np.abs(np.linalg.det(keypoints[:, 2:6].reshape(-1, 2, 2)))
-            largest = descriptors[np.argsort(-size, kind="stable")[:PRESELECTION_FEATURES]]
-            largest_of.append(_normalized(largest))
+            order = np.argsort(-feature_areas(keypoints), kind="stable")
+            largest_of.append(_normalized(descriptors[order[:PRESELECTION_FEATURES]]))
     return largest_of
 
 
