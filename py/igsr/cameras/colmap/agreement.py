@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from igsr._internal.load_pycolmap import load_pycolmap
 from igsr.cameras.colmap.contradictions import Pair
+from igsr.cameras.colmap.matcher import BEST_FEATURES
 
 Float64 = npt.NDArray[np.float64]
 
@@ -42,8 +43,10 @@ JOINING_FRACTION = 0.7
 JOINING_FRACTION_OF_TWO = 0.35
 MIN_SURE = 30
 SURE = 0.85
-#: A photo stays if at least this fraction of all its matches agrees with photos that stay.
+#: A photo stays if at least this fraction of its matches agrees with photos that stay: of the pairs
+#: that have this fraction of its strongest pair's matches.
 MIN_OWN_FRACTION = 0.5
+STRONG_FRACTION = 0.3
 
 
 def agreeing(
@@ -99,7 +102,7 @@ def consistent_part(counts: Mapping[Pair, int], matches: Mapping[Pair, Any]) -> 
     Photos are joined, most agreeing matches first, unless the matches between the two groups
     mostly disagree with the model: then a few look-alike matches hold wrong parts together. Two
     pairs of four photos that agree weigh more, since wrong pairs seldom agree with each other.
-    Photos that have most of their matches with others, left out, are left out too.
+    Photos whose strong pairs are mostly with others, left out, are left out too.
 
     Args:
         counts: of the pairs of placed photos, as from ``agreeing``.
@@ -131,11 +134,17 @@ def consistent_part(counts: Mapping[Pair, int], matches: Mapping[Pair, Any]) -> 
         group: sum(counts[pair] for pair in counts if group.issuperset(pair)) for group in groups
     }
     part = set(max(inside, key=lambda group: (inside[group], -min(group)), default=()))
-    while part:
+    strong: dict[int, list[Pair]] = {}
+    for photo in part:
+        own = {pair: len(matches[pair]) for pair in matches if photo in pair}
+        limit = STRONG_FRACTION * max(own.values())
+        strong[photo] = [pair for pair, count in own.items() if count >= limit]
+    while len(part) > 2:
         share = {
-            photo: sum(counts[pair] for pair in counts if photo in pair and part.issuperset(pair))
-            / sum(len(matches[pair]) for pair in matches if photo in pair)
-            for photo in part
+            photo: sum(counts[pair] for pair in pairs if part.issuperset(pair))
+            / sum(len(matches[pair]) for pair in pairs)
+            for photo, pairs in strong.items()
+            if photo in part
         }
         worst = min(share, key=lambda photo: (share[photo], photo))
         if share[worst] >= MIN_OWN_FRACTION:
@@ -165,7 +174,8 @@ def missing_matches(
     with pycolmap.Database.open(database) as opened:
         for n in numbers:
             count = opened.num_descriptors_for_image(n)
-            features[n], first[n] = opened.read_keypoints(n)[count:, :2].astype(np.float64), count
+            best = opened.read_keypoints(n)[count : count + BEST_FEATURES, :2]
+            features[n], first[n] = best.astype(np.float64), count
     depth: dict[int, float] = {}
     for n in numbers:
         seen = [p.point3D_id for p in model.images[n].get_observation_points2D()]
@@ -189,7 +199,8 @@ def missing_matches(
                 _shown(other, one, features[b], depth[b]),
             )
             shared = matches.get((a, b), np.zeros((0, 2), dtype=np.uint32))
-            learned = np.count_nonzero(shared[:, 0] >= first[a])
+            ranks = shared.astype(np.int64) - [first[a], first[b]]
+            learned = np.count_nonzero(((ranks >= 0) & (ranks < BEST_FEATURES)).all(axis=1))
             wanted = SHARED_FRACTION * np.exp(-angle / FALLING_ANGLE)
             if should >= MIN_SHARED and learned < wanted * should:
                 missing.add((a, b))

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from igsr._internal.extras import is_installed, naming_extra
-from igsr.cameras.colmap.matcher import PhotoFeatures
+from igsr.cameras.colmap.matcher import BEST_FEATURES, PhotoFeatures
 from igsr.cameras.weights import sha256_of
 from igsr.errors import IgsrError
 
@@ -28,9 +28,7 @@ WEIGHTS = {
 }
 #: Maximum number of features of a photo. Time of a pair grows with its square.
 MAX_FEATURES = 2048
-#: Number of the best features of a photo for the first matching of a pair, and the numbers of
-#: matches with which a pair is matched again with all features: fewer are by chance.
-BEST_FEATURES = 1024
+#: Numbers of matches with which a pair is matched again, with all features: fewer are by chance.
 MIN_MATCHES = 10
 MAX_WEAK_MATCHES = 150
 #: Minimum score of a feature: low, so that photos with little texture have features.

@@ -18,6 +18,8 @@ from igsr.cameras.estimate import Progress
 from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
 
+#: Number of a photo's first features with which each pair of photos is matched.
+BEST_FEATURES = 1024
 #: Minimum number of matches of a pair for verification (COLMAP's number of inliers).
 MIN_MATCHES = 15
 
