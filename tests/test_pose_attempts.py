@@ -97,6 +97,10 @@ def test_attempts_of_eight_photos(
         calls.append(f"extend {step} {database.stem}")
         model.placed |= further.get(step, set())
 
+    def agreed(model, matches, database):
+        placed = set(model.reg_image_ids())
+        return {pair: len(some) for pair, some in matches.items() if placed.issuperset(pair)}
+
     def look(matches, missing, show):
         calls.append("guided " + "".join(map(str, sorted(missing))))
         return Path("guided.db") if options.get("more", True) else None
@@ -108,8 +112,12 @@ def test_attempts_of_eight_photos(
     monkeypatch.setattr(attempts, "with_focal_lengths", lambda path, seed: path)
     monkeypatch.setattr(attempts, "links", lambda path: found)
     monkeypatch.setattr(attempts, "contradictions", lambda model, matches, usable: set())
+    monkeypatch.setattr(attempts, "missing_matches", lambda model, matches, database: set())
+    monkeypatch.setattr(attempts, "agreeing", agreed)
+    monkeypatch.setattr(attempts, "_models", lambda *arguments: iter([make(*arguments)]))
+    monkeypatch.setattr(attempts, "has_usual_focals", lambda model, database: True)
+    monkeypatch.setattr(attempts, "_without_disagreeing", lambda model, matches: model)
     monkeypatch.setattr(attempts, "matched_along_lines", look)
-    monkeypatch.setattr(attempts, "map_photos", make)
     monkeypatch.setattr(attempts, "extend", add)
     result = mapped(8, Path("matched.db"), 0, silent)
     assert calls == expected

@@ -73,35 +73,25 @@ class CameraSettings:
         else:
             known = " or ".join(ESTIMATORS)
             raise IgsrError(f"estimator must be {AUTO}, {known}, not {self.estimator!r}")
-        if self._has_matcher():
-            self._matchers()
         foreign = [name for name in self.options if name not in names]
         if foreign:
             raise IgsrError(f"{foreign[0]} is no option of {self.estimator}; leave it out")
+        _ = self.matchers  # raises if the name is unknown
 
-    def _has_matcher(self) -> bool:
-        return self.estimator == AUTO or "matcher" in _parameters(ESTIMATORS[self.estimator])
-
-    def _matchers(self) -> Matchers:
+    @property
+    def matchers(self) -> Matchers | None:
+        """The matchers of the estimator; None if it has none."""
+        if self.estimator != AUTO and "matcher" not in _parameters(ESTIMATORS[self.estimator]):
+            return None
         return chosen_matchers(self.options.get("matcher", AUTO))
-
-    def advice(self) -> str:
-        """How to place more photos; empty if igsr knows none."""
-        choice = self.options.get("matcher", AUTO)
-        if not self._has_matcher() or choice != AUTO or self._matchers().learned is not None:
-            return ""
-        return (
-            " pip install 'igsr[matching]' adds a trained matcher, which places photos from "
-            "further apart."
-        )
 
     def made_by(self) -> dict[str, Any]:
         """What the cameras depend on, except the photos, as JSON values."""
         plain = {
             name: str(value) for name, value in sorted(self.options.items()) if name != "matcher"
         }
-        if self._has_matcher():
-            plain["matcher"] = self._matchers().name
+        if self.matchers is not None:
+            plain["matcher"] = self.matchers.name
         return {
             "estimator": self.estimator,
             # "auto" runs the others.
@@ -227,12 +217,11 @@ def estimate(photos: Sequence[Photo], settings: CameraSettings, report: Listener
     else:
         found = ESTIMATORS[name].make(**settings.options)(photos, seed=seed, progress=progress)
     if sum(camera is not None for camera in found.cameras) < MIN_PHOTOS:
+        advice = "" if settings.matchers is None else settings.matchers.advice
         raise IgsrError(
             f"No cameras found: the {len(photos)} photos ({photos[0].name} and others) have too "
-            "few matches; take photos of one static scene that overlap more" + settings.advice()
+            f"few matches; take photos of one static scene that overlap more. {advice}".rstrip(". ")
         )
-    if found.warnings and settings.advice() and not all(found.cameras):
-        found.warnings[-1] += settings.advice()
     return found
 
 

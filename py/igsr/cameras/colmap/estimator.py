@@ -79,7 +79,10 @@ class Colmap:
             )
             if result.model is not None:
                 result = replace(result, model=without_distortion(result.model))
-        return estimate_of(photos, result)
+        found = estimate_of(photos, result)
+        if self._matchers.advice and not all(found.cameras):
+            found.warnings.append(self._matchers.advice)
+        return found
 
 
 def camera_seconds(sizes: Sequence[tuple[int, int]]) -> float:

@@ -13,7 +13,7 @@ from igsr.cameras.colmap.database import known_cameras
 from igsr.cameras.estimate import Progress
 
 #: Minimum number of photos to find lens distortion.
-MIN_DISTORTION_PHOTOS = 5
+MIN_DISTORTION_PHOTOS = 4
 #: Lens distortion is dropped if the squared error grows by at most this factor: photos that are not
 #: resampled stay sharp, and from few photos distortion is often a wrong focal length.
 MAX_ERROR_FACTOR = 1.02

@@ -14,6 +14,9 @@ from igsr.errors import IgsrError
 AUTO = "auto"
 MATCHERS = (AUTO, "sift", "aliked")
 
+ADVICE = (
+    "pip install 'igsr[matching]' adds a trained matcher, which places photos from further apart."
+)
 #: A name of ``MATCHERS``, or the user's own.
 Choice: TypeAlias = "str | Matcher"
 
@@ -26,11 +29,13 @@ class Matchers:
         name: for reports, and to recognize cameras found with them.
         sift: whether SIFT is one of them.
         learned: makes the other one, or None.
+        advice: how to place more photos, or "".
     """
 
     name: str
     sift: bool
     learned: Callable[[], Matcher] | None
+    advice: str = ""
 
 
 def chosen_matchers(choice: Choice) -> Matchers:
@@ -39,10 +44,10 @@ def chosen_matchers(choice: Choice) -> Matchers:
     Raises:
         IgsrError: the name is unknown, or a custom matcher has no name.
     """
-    if choice == AUTO:
-        choice = "sift+aliked" if aliked.is_available() else "sift"
-    if choice == "sift+aliked":
+    if choice == AUTO and aliked.is_available():
         return Matchers("sift+aliked", True, aliked.Aliked)
+    if choice == AUTO:
+        return Matchers("sift", True, None, ADVICE)
     if choice == "sift":
         return Matchers("sift", True, None)
     if choice == "aliked":
