@@ -9,6 +9,7 @@ import pytest
 import refinements
 
 from igsr import cli
+from igsr.cameras.colmap import aliked
 from igsr.refinement import refine_photos, rounds
 from igsr_lab import __main__ as lab
 
@@ -18,6 +19,16 @@ collect_ignore = [] if os.environ.get("IGSR_DA3_FIXTURES") else ["test_da3_publi
 # A failure must be the same failure on the next run, and a slow machine is no failure.
 hypothesis.settings.register_profile("igsr", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("igsr")
+
+#: Matcher "auto" is SIFT in tests, which is faster, except in those that use ``with_aliked``.
+aliked_is_available = aliked.is_available
+aliked.is_available = lambda: False
+
+
+@pytest.fixture
+def with_aliked(monkeypatch):
+    """Make matcher "auto" what it is for users."""
+    monkeypatch.setattr(aliked, "is_available", aliked_is_available)
 
 
 def pytest_report_header() -> list[str]:

@@ -16,6 +16,7 @@ from igsr.cameras.alignment import AlignedPhoto
 from igsr.cameras.all_evidence import with_all_evidence
 from igsr.cameras.cameras_file import KeptCameras, read_cameras_file, write_cameras_file
 from igsr.cameras.colmap import Colmap
+from igsr.cameras.colmap.matchers import chosen_matchers
 from igsr.cameras.da3.estimator import Da3
 from igsr.cameras.da3.prediction import resampling_of
 from igsr.cameras.found_cameras import FoundCameras
@@ -83,7 +84,7 @@ def colmap_places_none(monkeypatch):
 
 def together(photos, start, seed=0):
     sure = [None if one is None else np.ones(one.depth.shape, bool) for one in start]
-    return with_all_evidence(photos, start, sure, "The network", None, seed)
+    return with_all_evidence(photos, start, sure, "The network", chosen_matchers("sift"), seed)
 
 
 def rests_on(found):

@@ -12,6 +12,7 @@ import igsr
 from igsr.cameras import find
 from igsr.cameras.colmap import Colmap
 from igsr.cameras.colmap.matcher import PhotoFeatures
+from igsr.cameras.colmap.pairs import SIMILAR_LEARNED, similar_pairs
 from igsr.cameras.find import CameraSettings
 from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
@@ -116,13 +117,23 @@ def test_invalid_features_are_errors():
         Colmap(Wrong())(photos(2), seed=0)
 
 
-def test_a_matcher_needs_a_name_and_few_photos():
-    with pytest.raises(IgsrError, match=r"^matcher known compares every pair of photos: give"):
-        Colmap(Known())(photos(61), seed=0)
-    with pytest.raises(IgsrError, match="needs an attribute name"):
+def test_unknown_matchers_are_errors():
+    with pytest.raises(IgsrError, match="matcher must be auto, sift, aliked or an object with"):
         Colmap(object())
+    with pytest.raises(IgsrError, match=r"matcher must be auto, .* not 'surf'"):
+        igsr.find_cameras(photos(2), "colmap", matcher="surf")
     with pytest.raises(IgsrError, match="matcher is no option of dust3r"):
         igsr.find_cameras(photos(2), "dust3r", matcher=Known())
+
+
+def test_of_many_photos_similar_ones_are_matched():
+    turned = [np.roll(np.eye(40, 8, dtype=np.float32), k, axis=1) for k in range(8)]
+    descriptors = [np.vstack([turned[k % 8], turned[(k + 1) % 8]]) for k in range(40)]
+    pairs = similar_pairs(descriptors)
+    assert len(pairs) < 40 * SIMILAR_LEARNED
+    assert all(a < b for a, b in pairs)
+    assert {photo for pair in pairs for photo in pair} == set(range(40))
+    assert len(similar_pairs(descriptors[:12])) == 66
 
 
 def test_kept_cameras_depend_on_their_matcher_and_on_all_methods(monkeypatch):

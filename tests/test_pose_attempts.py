@@ -46,7 +46,7 @@ class Model:
 
 RETRIES = [
     *("map 0 matched", "extend 1 matched", "guided 67", "extend 2 guided"),
-    *("guided 01234567", "map 3 guided", "map 4 guided"),
+    *("guided 01234567", "map 3 guided", "extend 4 guided"),
 ]
 
 
@@ -59,7 +59,7 @@ RETRIES = [
         ({0: 6}, {1: {6}, 2: {7}}, {}, [*RETRIES[:2], "guided 7", RETRIES[3]], 8, False),
         # With lower thresholds all photos are mapped again; with more evidence a model is kept.
         ({0: 6, 3: 7}, {2: {6}}, {}, RETRIES, 7, False),
-        ({0: 6, 4: 8}, {}, {}, RETRIES, 8, True),
+        ({0: 6, 3: 7}, {4: {7}}, {}, RETRIES, 8, True),
         # A model without many photos is replaced; later ones too, even if they lack few photos.
         (
             {0: 2, 1: 6, 2: 7, 3: 8},
@@ -97,6 +97,10 @@ def test_attempts_of_eight_photos(
         calls.append(f"extend {step} {database.stem}")
         model.placed |= further.get(step, set())
 
+    def agreed(model, matches, database):
+        placed = set(model.reg_image_ids())
+        return {pair: len(some) for pair, some in matches.items() if placed.issuperset(pair)}
+
     def look(matches, missing, show):
         calls.append("guided " + "".join(map(str, sorted(missing))))
         return Path("guided.db") if options.get("more", True) else None
@@ -108,8 +112,12 @@ def test_attempts_of_eight_photos(
     monkeypatch.setattr(attempts, "with_focal_lengths", lambda path, seed: path)
     monkeypatch.setattr(attempts, "links", lambda path: found)
     monkeypatch.setattr(attempts, "contradictions", lambda model, matches, usable: set())
+    monkeypatch.setattr(attempts, "missing_matches", lambda model, matches, database: set())
+    monkeypatch.setattr(attempts, "agreeing", agreed)
+    monkeypatch.setattr(attempts, "_models", lambda *arguments: iter([make(*arguments)]))
+    monkeypatch.setattr(attempts, "has_usual_focals", lambda model, database: True)
+    monkeypatch.setattr(attempts, "_without_disagreeing", lambda model, matches: model)
     monkeypatch.setattr(attempts, "matched_along_lines", look)
-    monkeypatch.setattr(attempts, "map_photos", make)
     monkeypatch.setattr(attempts, "extend", add)
     result = mapped(8, Path("matched.db"), 0, silent)
     assert calls == expected
@@ -154,6 +162,18 @@ def test_a_photo_is_added_to_a_model_of_the_others(tmp_path):
     assert sum(after[p] for p in with_missing) > 1.05 * sum(before[p] for p in with_missing)
     assert shown[-1] == (len(with_missing), len(with_missing))
     assert matched_along_lines(database, [], silent) is None
+
+    # Keypoints without descriptors keep their matches.
+    pair = image_id(3), image_id(4)
+    with pycolmap.Database.open(database) as opened:
+        geometry = opened.read_two_view_geometry(*pair)
+        keypoints = [opened.read_keypoints(image) for image in pair]
+        for image, of_image in zip(pair, keypoints, strict=True):
+            opened.update_keypoints(image, np.vstack([of_image, of_image[:1]]))
+        added = np.array([[len(of_image) for of_image in keypoints]], dtype=np.uint32)
+        geometry.inlier_matches = np.vstack([geometry.inlier_matches, added])
+        opened.update_two_view_geometry(*pair, geometry)
+    assert inliers(matched_along_lines(database, [4], silent))[pair] == after[pair] + 1
 
 
 def inliers(database):

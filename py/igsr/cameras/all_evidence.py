@@ -26,7 +26,7 @@ from igsr.cameras.colmap.adjustment import (
 from igsr.cameras.colmap.attempts import FIRST_DOUBTFUL, THRESHOLDS, Mapped, mapped
 from igsr.cameras.colmap.estimator import guarded, matched_photos, usable_by_image_id
 from igsr.cameras.colmap.mapping import without_distortion
-from igsr.cameras.colmap.matcher import Matcher
+from igsr.cameras.colmap.matchers import Matchers
 from igsr.cameras.colmap.matching import matched_along_lines, with_matches
 from igsr.cameras.colmap.predicted_matches import matched_by_prediction, without_contradictions
 from igsr.cameras.colmap.result import estimate_of
@@ -77,7 +77,7 @@ def with_all_evidence(
     predicted: Sequence[AlignedPhoto | None],
     confident: Sequence[npt.NDArray[np.bool_] | None],
     network: str,
-    matcher: Matcher | None,
+    matchers: Matchers,
     seed: int,
     progress: Progress | None = None,
 ) -> Evidence:
@@ -89,7 +89,7 @@ def with_all_evidence(
             the same in both directions.
         confident: bool [h, w] per photo: depths of which the network is confident.
         network: its name, for messages.
-        matcher: of features; None for SIFT.
+        matchers: of features.
         seed: random seed.
         progress: as for estimators.
 
@@ -98,14 +98,14 @@ def with_all_evidence(
     """
     show = progress or (lambda stage, done, total: None)
     with tempfile.TemporaryDirectory(prefix="igsr-colmap-") as folder, guarded(seed):
-        matches = matched_photos(photos, Path(folder), matcher, seed, show)
+        matches = matched_photos(photos, Path(folder), matchers, seed, show)
         # Not COLMAP's lowest thresholds: the prediction is more reliable.
         found = mapped(
             len(photos),
             matches,
             seed,
             show,
-            sift=matcher is None,
+            sift=matchers.sift,
             usable=usable_by_image_id(photos),
             attempts=THRESHOLDS[:FIRST_DOUBTFUL],
         )
@@ -132,7 +132,7 @@ def with_all_evidence(
             world = list(predicted)
             warnings.append(f"{contradiction}; these features are not used")
         result = _adjusted(
-            photos, world, confident, found, placed, matches, matcher is None, seed, show
+            photos, world, confident, found, placed, matches, matchers.sift, seed, show
         )
     both = _by_both(photos, world, found, result, network)
     return replace(both, warnings=[*warnings, *both.warnings])

@@ -13,6 +13,7 @@ from typing import Any, TypeAlias
 from igsr._internal.event import Event, Listener
 from igsr._internal.user_warning import warn_user
 from igsr.cameras.auto import auto_estimate
+from igsr.cameras.colmap.matchers import Matchers, chosen_matchers
 from igsr.cameras.estimate import Estimate
 from igsr.cameras.found_cameras import FoundCameras
 from igsr.cameras.registry import ESTIMATORS
@@ -36,7 +37,7 @@ AUTO = "auto"
 #: Longest side of the photos that estimators are given, pixels.
 MAX_SIDE_PX = 1600
 #: Version of each estimator's method; raise it to find kept cameras again.
-METHODS = {"colmap": 3, "da3": 2, "dust3r": 1, AUTO: 1}
+METHODS = {"colmap": 4, "da3": 3, "dust3r": 1, AUTO: 2}
 
 Source: TypeAlias = str | os.PathLike[str] | Sequence[str | os.PathLike[str] | Photo]
 
@@ -75,14 +76,22 @@ class CameraSettings:
         foreign = [name for name in self.options if name not in names]
         if foreign:
             raise IgsrError(f"{foreign[0]} is no option of {self.estimator}; leave it out")
+        _ = self.matchers  # raises if the name is unknown
+
+    @property
+    def matchers(self) -> Matchers | None:
+        """The matchers of the estimator; None if it has none."""
+        if self.estimator != AUTO and "matcher" not in _parameters(ESTIMATORS[self.estimator]):
+            return None
+        return chosen_matchers(self.options.get("matcher", AUTO))
 
     def made_by(self) -> dict[str, Any]:
         """What the cameras depend on, except the photos, as JSON values."""
         plain = {
-            # A custom matcher is identified by its name.
-            name: str(value if isinstance(value, os.PathLike) else getattr(value, "name", value))
-            for name, value in sorted(self.options.items())
+            name: str(value) for name, value in sorted(self.options.items()) if name != "matcher"
         }
+        if self.matchers is not None:
+            plain["matcher"] = self.matchers.name
         return {
             "estimator": self.estimator,
             # "auto" runs the others.
@@ -115,7 +124,8 @@ def find_cameras(
         max_size: longest side of the capture's photos in pixels; larger ones are reduced. None
             keeps their size. The cameras do not depend on it.
         progress: called with each ``igsr.Event``.
-        options: of the estimator: COLMAP's ``matcher`` (a ``Matcher``); DUSt3R's ``checkpoint``,
+        options: of the estimator: COLMAP's ``matcher`` ("auto": "sift" and, if the extra
+            ``matching`` is installed, "aliked"; or a ``Matcher``); DUSt3R's ``checkpoint``,
             ``graph`` and ``cameras``; Depth Anything 3's ``checkpoint``, ``cameras``,
             ``cameras_from``, ``bundle_adjustment`` and ``matcher``.
 
@@ -207,9 +217,10 @@ def estimate(photos: Sequence[Photo], settings: CameraSettings, report: Listener
     else:
         found = ESTIMATORS[name].make(**settings.options)(photos, seed=seed, progress=progress)
     if sum(camera is not None for camera in found.cameras) < MIN_PHOTOS:
+        advice = "" if settings.matchers is None else settings.matchers.advice
         raise IgsrError(
             f"No cameras found: the {len(photos)} photos ({photos[0].name} and others) have too "
-            "few matches; take photos of one static scene that overlap more"
+            f"few matches; take photos of one static scene that overlap more. {advice}".rstrip(". ")
         )
     return found
 

@@ -13,7 +13,7 @@ from igsr.cameras.estimate import Estimator
 from igsr.capture import Camera
 
 if TYPE_CHECKING:
-    from igsr.cameras.colmap.matcher import Matcher
+    from igsr.cameras.colmap.matchers import Choice
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ def _dust3r(
     return Dust3r(checkpoint=checkpoint, graph=graph, cameras=cameras)
 
 
-def _colmap(matcher: Matcher | None = None) -> Estimator:
+def _colmap(matcher: Choice = "auto") -> Estimator:
     from igsr.cameras.colmap import Colmap
 
     return Colmap(matcher)
@@ -49,7 +49,7 @@ def _colmap(matcher: Matcher | None = None) -> Estimator:
 def _da3(
     checkpoint: str | os.PathLike[str] | None = None,
     bundle_adjustment: bool = True,
-    matcher: Matcher | None = None,
+    matcher: Choice = "auto",
 ) -> Estimator:
     with naming_extra("estimator da3"):
         from igsr.cameras.da3.estimator import Da3

@@ -89,6 +89,15 @@ CheckpointOption = Annotated[
     Path | None,
     option("--checkpoint", metavar="FILE", help="Weights for dust3r or da3.", panel=CAMERAS),
 ]
+MatcherOption = Annotated[
+    str | None,
+    option(
+        "--matcher",
+        metavar="NAME",
+        help="Matcher of photos: auto (both if installed), sift or aliked.",
+        panel=CAMERAS,
+    ),
+]
 FramesOption = Annotated[
     int, option("--frames", metavar="N", help="Maximum frames of each video.", panel=CAMERAS)
 ]
@@ -179,9 +188,10 @@ def photos_or_example(photos: Path | None, is_example: bool, out: Path) -> Path:
     return photos
 
 
-def estimator_options(checkpoint: Path | None) -> dict[str, Any]:
+def estimator_options(checkpoint: Path | None, matcher: str | None) -> dict[str, Any]:
     """The options of the camera estimator that were given."""
-    return {} if checkpoint is None else {"checkpoint": checkpoint}
+    given = {"checkpoint": checkpoint, "matcher": matcher}
+    return {name: value for name, value in given.items() if value is not None}
 
 
 def picture_name(view_name: str, suffix: str) -> Path:

@@ -19,6 +19,7 @@ from igsr.cli.options import (
     EstimatorOption,
     FramesOption,
     JsonOption,
+    MatcherOption,
     MaxSizeOption,
     SeedOption,
     estimator_options,
@@ -38,6 +39,7 @@ def pose_command(
     out: Annotated[Path, option("--out", help="New or empty folder for the capture.")],
     estimator: EstimatorOption = "auto",
     checkpoint: CheckpointOption = None,
+    matcher: MatcherOption = None,
     graph: Annotated[
         str | None,
         option(
@@ -62,7 +64,9 @@ def pose_command(
                 f"{given} has cameras already; fit it as it is, or name an --estimator to find "
                 "them again"
             )
-        options = estimator_options(checkpoint) | ({} if graph is None else {"graph": graph})
+        options = estimator_options(checkpoint, matcher) | (
+            {} if graph is None else {"graph": graph}
+        )
         from igsr.cameras.find import CameraSettings
 
         settings = CameraSettings(estimator, options, seed, frames)

@@ -20,6 +20,7 @@ from igsr.cli.options import (
     FitSizeOption,
     HoldoutOption,
     JsonOption,
+    MatcherOption,
     PhotosArgument,
     QualityOption,
     ResumeOption,
@@ -52,6 +53,7 @@ def refine_command(
     as_json: JsonOption = False,
     estimator: EstimatorOption = "auto",
     checkpoint: CheckpointOption = None,
+    matcher: MatcherOption = None,
     allow_missing: AllowMissingOption = False,
     steps: Annotated[
         int | None, option("--steps", metavar="N", help="Optimizer steps of each fit.", panel=FIT)
@@ -88,7 +90,7 @@ def refine_command(
                 holdout=holdout,
                 max_size=max_size,
                 estimator=estimator,
-                estimator_options=estimator_options(checkpoint),
+                estimator_options=estimator_options(checkpoint, matcher),
                 allow_missing=allow_missing,
                 resume=resume,
                 progress=show,

@@ -2,14 +2,14 @@
 
 If COLMAP's own thresholds leave out few photos, more matches are searched for these, and the model
 is extended. If they leave out many, more matches are searched for all pairs, and mapping starts
-over. A model that contradicts its photos is mapped again without the wrong matches
-(``contradictions``).
+over, as it does with the first thresholds that may give a wrong model. A model that contradicts its
+photos is mapped again without the wrong matches (``contradictions``).
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from igsr.cameras.colmap.agreement import (
+    GOOD_FRACTION,
+    agreeing,
+    consistent_part,
+    missing_matches,
+)
 from igsr.cameras.colmap.contradictions import (
     Pair,
     contradictions,
@@ -26,8 +32,13 @@ from igsr.cameras.colmap.contradictions import (
     parts,
 )
 from igsr.cameras.colmap.database import image_id
-from igsr.cameras.colmap.mapping import Thresholds, extend, map_photos
-from igsr.cameras.colmap.matching import matched_along_lines, with_focal_lengths
+from igsr.cameras.colmap.mapping import Thresholds, extend, map_globally, map_photos
+from igsr.cameras.colmap.matching import (
+    has_usual_focals,
+    matched_along_lines,
+    with_focal_lengths,
+    with_other_focal_lengths,
+)
 from igsr.cameras.estimate import Progress
 
 #: COLMAP's thresholds first, then lower ones.
@@ -42,6 +53,9 @@ THRESHOLDS = (
 FIRST_DOUBTFUL = 3
 #: Maximum number of photos for retries.
 MAX_RETRY_PHOTOS = 60
+#: Initial focal lengths to try, in units of the longer side, if there are at most this many photos.
+FOCALS = (1.2, 0.7, 2.0)
+MAX_TRIAL_PHOTOS = 12
 #: Maximum fraction of missing photos to extend a model instead of mapping again.
 MAX_MISSING_FRACTION = 0.25
 #: Maximum number of times that matches are left out for one model.
@@ -89,11 +103,11 @@ def mapped(
     hopeless = set(range(count)) - {image - image_id(0) for pair in strengths for image in pair}
     source, database = matches, with_focal_lengths(matches, seed)
     best: Any | None = None
-    best_attempt = 0
+    best_attempt, most_agreeing = 0, -1
     guided: set[int] = set()
     few_missing = False
     for attempt, thresholds in enumerate(attempts):
-        extending = few_missing and attempt < FIRST_DOUBTFUL
+        extending = few_missing and attempt != FIRST_DOUBTFUL and _agrees(best, matches)
         if thresholds.guided_matching:
             wanted = _missing(best, count) if extending else set(range(count))
             if not wanted <= guided:
@@ -108,9 +122,9 @@ def mapped(
             model = copy.deepcopy(best)
             extend(model, count, database, thresholds, seed, show)
         else:
-            model = map_photos(count, database, thresholds, seed, show)
+            model = _mapped_once(count, matches, database, thresholds, seed, show)
         for remapping in range(MAX_REMAPPINGS):
-            wrong = _wrong_links(model, source, strengths, usable or {})
+            wrong = _wrong_links(model, matches, source, strengths, usable or {})
             if not wrong:
                 break
             if attempt >= FIRST_DOUBTFUL or remapping + 1 == MAX_REMAPPINGS:
@@ -122,22 +136,79 @@ def mapped(
                 leave_out(file, wrong)
             database = with_focal_lengths(source, seed)
             # Mapped anew, because an extended model would keep its wrong cameras.
-            model = map_photos(count, database, thresholds, seed, show)
-        if model is not None and (best is None or model.num_reg_images() > best.num_reg_images()):
-            best, best_attempt = model, attempt
+            best, most_agreeing = None, -1
+            model = _mapped_once(count, matches, database, thresholds, seed, show)
+        if model is not None:
+            agreed = sum(agreeing(model, links(matches), matches).values())
+            if agreed > most_agreeing:
+                best, best_attempt, most_agreeing = model, attempt, agreed
         missing = _missing(best, count)
         if best is not None and len(strengths) < all_links:
             hopeless = _unlinked(best, strengths, count)
-        if best is not None and (count > MAX_RETRY_PHOTOS or missing <= hopeless):
+        if best is not None and count > MAX_RETRY_PHOTOS:
+            break
+        if missing <= hopeless and _agrees(best, matches):
             break
         if attempt == 0:
             few_missing = len(missing) <= MAX_MISSING_FRACTION * count
     show("mapping", count, count)
+    if best is not None and count <= MAX_RETRY_PHOTOS:
+        best = _without_disagreeing(best, matches)
     return Mapped(best, best_attempt >= FIRST_DOUBTFUL, all_links - len(strengths))
+
+
+def _mapped_once(
+    count: int, matches: Path, database: Path, thresholds: Thresholds, seed: int, show: Progress
+) -> Any | None:
+    """The model with which most matches agree, until one of all photos does."""
+    best: Any | None = None
+    most = -1
+    for model in _models(count, database, thresholds, seed, show):
+        if model is not None and has_usual_focals(model, database):
+            agreed = sum(agreeing(model, links(matches), matches).values())
+            if agreed > most:
+                best, most = model, agreed
+            if not _missing(model, count) and _agrees(model, matches):
+                break
+    return best
+
+
+def _models(
+    count: int, database: Path, thresholds: Thresholds, seed: int, show: Progress
+) -> Iterator[Any | None]:
+    """Models of a database: of the incremental mapper, the global one, and other focal lengths."""
+    yield map_photos(count, database, thresholds, seed, show)
+    if count <= MAX_TRIAL_PHOTOS:
+        if not thresholds.ignore_two_view_tracks:
+            yield map_globally(database, thresholds, seed)
+        for start in with_other_focal_lengths(database, FOCALS):
+            yield map_photos(count, start, thresholds, seed, show)
+
+
+def _agrees(model: Any | None, matches: Path) -> bool:
+    """Whether nearly all matches between a model's photos agree with it."""
+    if model is None:
+        return False
+    verified = links(matches)
+    counts = agreeing(model, verified, matches)
+    total = sum(len(verified[pair]) for pair in counts)
+    return sum(counts.values()) >= GOOD_FRACTION * total
+
+
+def _without_disagreeing(model: Any, matches: Path) -> Any | None:
+    """The largest part of a model that agrees with the matches; None if fewer than two photos."""
+    verified = links(matches)
+    part = consistent_part(agreeing(model, verified, matches), verified)
+    if len(part) < 2:
+        return None
+    for image in sorted(set(model.reg_image_ids()) - part):
+        model.deregister_frame(model.images[image].frame_id)
+    return model
 
 
 def _wrong_links(
     model: Any | None,
+    matches: Path,
     source: Path,
     strengths: dict[Pair, int],
     usable: Mapping[int, npt.NDArray[np.bool_]],
@@ -145,7 +216,11 @@ def _wrong_links(
     """Pairs of photos whose matches make a model contradict its photos."""
     if model is None or model.num_reg_images() > MAX_RETRY_PHOTOS:
         return set()
-    return links_between_parts(strengths, contradictions(model, links(source), usable))
+    return links_between_parts(
+        strengths,
+        contradictions(model, links(source), usable),
+        missing_matches(model, links(matches), matches),
+    )
 
 
 def _unlinked(model: Any, strengths: dict[Pair, int], count: int) -> set[int]:

@@ -157,7 +157,9 @@ def _inside(image: Any, xyz: Float64, usable: Bool | None) -> Bool:
     return inside
 
 
-def parts(strengths: Mapping[Pair, int], contradicted: Collection[Pair]) -> dict[int, int]:
+def parts(
+    strengths: Mapping[Pair, int], contradicted: Collection[Pair], apart: Collection[Pair] = ()
+) -> dict[int, int]:
     """Divide photos into parts, strongest links first.
 
     A link that would put a contradicted pair into one part is ignored, unless it is nearly as
@@ -166,6 +168,7 @@ def parts(strengths: Mapping[Pair, int], contradicted: Collection[Pair]) -> dict
     Args:
         strengths: number of matches of each pair of photos.
         contradicted: pairs that should not be in one part.
+        apart: pairs that are not in one part, however strong the link.
 
     Returns:
         For each photo the smallest number in its part.
@@ -177,10 +180,14 @@ def parts(strengths: Mapping[Pair, int], contradicted: Collection[Pair]) -> dict
     part = {photo: {photo} for photo in strongest}
     for (a, b), strength in sorted(strengths.items(), key=lambda link: (-link[1], link[0])):
         first, second = part[a], part[b]
-        if first is second or any(
-            strength < MIN_LINK_FRACTION * min(strongest.get(x, 0), strongest.get(y, 0))
-            for x, y in contradicted
-            if (x in first and y in second) or (x in second and y in first)
+        if (
+            first is second
+            or any(
+                strength < MIN_LINK_FRACTION * min(strongest.get(x, 0), strongest.get(y, 0))
+                for x, y in contradicted
+                if (x in first and y in second) or (x in second and y in first)
+            )
+            or any((x in first and y in second) or (x in second and y in first) for x, y in apart)
         ):
             continue
         first |= second
@@ -188,9 +195,11 @@ def parts(strengths: Mapping[Pair, int], contradicted: Collection[Pair]) -> dict
     return {photo: min(members) for photo, members in part.items()}
 
 
-def links_between_parts(strengths: Mapping[Pair, int], contradicted: Collection[Pair]) -> set[Pair]:
+def links_between_parts(
+    strengths: Mapping[Pair, int], contradicted: Collection[Pair], apart: Collection[Pair] = ()
+) -> set[Pair]:
     """The pairs of photos in different ``parts``, whose matches are left out."""
-    if not contradicted:
+    if not contradicted and not apart:
         return set()
-    part = parts(strengths, contradicted)
+    part = parts(strengths, contradicted, apart)
     return {(a, b) for a, b in strengths if part[a] != part[b]}

@@ -18,7 +18,8 @@ from igsr.cameras.colmap.attempts import mapped
 from igsr.cameras.colmap.database import image_id, list_photos
 from igsr.cameras.colmap.features import MAX_SIDE_PX, find_features, usable_pixels
 from igsr.cameras.colmap.mapping import without_distortion
-from igsr.cameras.colmap.matcher import Matcher, checked_matcher, matched_by
+from igsr.cameras.colmap.matcher import add_matches
+from igsr.cameras.colmap.matchers import AUTO, Choice, Matchers, chosen_matchers
 from igsr.cameras.colmap.matching import matched
 from igsr.cameras.colmap.pairs import FOLLOWING_PHOTOS, MAX_EXHAUSTIVE_PHOTOS, SIMILAR_PHOTOS
 from igsr.cameras.colmap.result import estimate_of
@@ -39,16 +40,16 @@ class Colmap:
     """Finds cameras with pycolmap.
 
     Args:
-        matcher: finds and matches features; None for SIFT.
+        matcher: finds and matches features; a name of ``MATCHERS`` or a ``Matcher``.
 
     Raises:
-        IgsrError: the matcher has no name.
+        IgsrError: as ``chosen_matchers``.
     """
 
     name = "colmap"
 
-    def __init__(self, matcher: Matcher | None = None) -> None:
-        self._matcher = checked_matcher(matcher)
+    def __init__(self, matcher: Choice = AUTO) -> None:
+        self._matchers = chosen_matchers(matcher)
 
     def __call__(
         self, photos: Sequence[Photo], *, seed: int = 0, progress: Progress | None = None
@@ -67,14 +68,21 @@ class Colmap:
             )
         with tempfile.TemporaryDirectory(prefix="igsr-colmap-") as folder, guarded(seed):
             workspace = Path(folder)
-            matches = matched_photos(photos, workspace, self._matcher, seed, show)
-            sift = self._matcher is None
+            matches = matched_photos(photos, workspace, self._matchers, seed, show)
             result = mapped(
-                len(photos), matches, seed, show, sift=sift, usable=usable_by_image_id(photos)
+                len(photos),
+                matches,
+                seed,
+                show,
+                sift=self._matchers.sift,
+                usable=usable_by_image_id(photos),
             )
             if result.model is not None:
                 result = replace(result, model=without_distortion(result.model))
-        return estimate_of(photos, result)
+        found = estimate_of(photos, result)
+        if self._matchers.advice and not all(found.cameras):
+            found.warnings.append(self._matchers.advice)
+        return found
 
 
 def camera_seconds(sizes: Sequence[tuple[int, int]]) -> float:
@@ -96,26 +104,29 @@ def camera_seconds(sizes: Sequence[tuple[int, int]]) -> float:
 
 
 def matched_photos(
-    photos: Sequence[Photo], workspace: Path, matcher: Matcher | None, seed: int, show: Progress
+    photos: Sequence[Photo], workspace: Path, matchers: Matchers, seed: int, show: Progress
 ) -> Path:
     """Create a database of photos, features and verified matches.
 
     Args:
         photos: at least two.
         workspace: folder for the database.
-        matcher: finds and matches features; None for SIFT.
+        matchers: find and match features; all matches of a pair are verified together.
         seed: of the verification.
-        show: called with "features" or "matching", done and total.
+        show: called with a stage, done and total.
 
     Raises:
-        IgsrError: as ``matched_by``.
+        IgsrError: as ``add_matches``.
     """
     database = workspace / "database.db"
     list_photos(photos, database)
-    if matcher is not None:
-        return matched_by(matcher, photos, database, seed, show)
-    find_features(photos, database, show)
-    return matched(len(photos), database, seed, show)
+    learned = matchers.learned
+    if matchers.sift:
+        find_features(photos, database, show)
+        database = matched(len(photos), database, seed, show, verify=learned is None)
+    if learned is not None:
+        add_matches(learned(), photos, database, seed, show)
+    return database
 
 
 def usable_by_image_id(photos: Sequence[Photo]) -> dict[int, npt.NDArray[np.bool_]]:

@@ -1,21 +1,10 @@
-"""SIFT features of photos, found by COLMAP from arrays.
-
-COLMAP's extractor holds Python's lock, so several photos at a time need several processes.
-``serve`` runs in each of them.
-"""
+"""SIFT features of photos, found by COLMAP from arrays."""
 
 from __future__ import annotations
 
-import contextlib
-import os
-import pickle
-import signal
-import subprocess
-import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from queue import SimpleQueue
 from typing import TypeAlias
 
 import numpy as np
@@ -23,14 +12,19 @@ import numpy.typing as npt
 
 from igsr._internal.load_pycolmap import load_pycolmap
 from igsr.cameras.colmap.database import image_id
+from igsr.cameras.colmap.processes import process_count, processes
 from igsr.cameras.estimate import Progress
 from igsr.capture.photo_folder import Photo
-from igsr.errors import IgsrError
 
 #: Longest side of a photo at which features are found, pixels.
 MAX_SIDE_PX = 1600
-#: Maximum number of processes; each may take 0.5 GB.
-MAX_PROCESSES = 4
+#: Maximum number of features of a photo; the largest are kept. COLMAP's own maximum leaves more.
+MAX_FEATURES = 8192
+#: A photo with this many features at its own size is not searched at twice its size too, as COLMAP
+#: does, which takes four times as long.
+ENOUGH_FEATURES = 3072
+#: Pixels of a photo that may have this many.
+MIN_ONCE_PX = 800_000
 #: With fewer pixels in all, one process is faster.
 MIN_PARALLEL_PX = 2_000_000
 #: Gray values of red, green and blue (BT.601).
@@ -38,7 +32,6 @@ GRAY_WEIGHTS = np.array([0.299, 0.587, 0.114])
 
 #: Keypoints float32 [N, 6]: x, y and the affine shape; descriptors uint8 [N, 128].
 Features: TypeAlias = tuple[npt.NDArray[np.float32], npt.NDArray[np.uint8]]
-Extract: TypeAlias = Callable[[npt.NDArray[np.uint8]], Features]
 
 
 def find_features(photos: Sequence[Photo], database: Path, show: Progress) -> None:
@@ -71,24 +64,13 @@ def usable_pixels(photo: Photo) -> npt.NDArray[np.bool_] | None:
 def _features(photos: Sequence[Photo]) -> Iterator[Features]:
     """Features of each photo, in order."""
     pixels = sum(photo.image.shape[0] * photo.image.shape[1] for photo in photos)
-    count = min(MAX_PROCESSES, os.cpu_count() or 1, len(photos))
+    count = min(process_count(), len(photos))
+    octave = _first_octave(photos)
     if count == 1 or pixels < MIN_PARALLEL_PX:
-        yield from (_sift(_gray(photo)) for photo in photos)
+        yield from (_sift(_gray(photo), octave) for photo in photos)
         return
-    with contextlib.ExitStack() as closing:
-        free: SimpleQueue[Extract] = SimpleQueue()
-        for _ in range(count):
-            free.put(closing.enter_context(_sift_process()))
-        pool = closing.enter_context(ThreadPoolExecutor(count))
-
-        def found(photo: Photo) -> Features:
-            extract = free.get()
-            try:
-                return extract(_gray(photo))
-            finally:
-                free.put(extract)
-
-        yield from pool.map(found, photos)
+    with processes(count) as call, ThreadPoolExecutor(count) as pool:
+        yield from pool.map(lambda photo: call(_sift, _gray(photo), octave), photos)
 
 
 def _gray(photo: Photo) -> npt.NDArray[np.uint8]:
@@ -111,54 +93,34 @@ def _inside(
     return inside
 
 
-def _sift(gray: npt.NDArray[np.uint8]) -> Features:
+def _first_octave(photos: Sequence[Photo]) -> int:
+    """0 to search photos at their own size, -1 at twice their size; judged by one of them.
+
+    All are searched alike: features of two sizes are placed less accurately.
+    """
+    gray = _gray(photos[len(photos) // 2])
+    if gray.size < MIN_ONCE_PX:
+        return -1
+    return 0 if len(_sift(gray, 0)[0]) >= ENOUGH_FEATURES else -1
+
+
+def _sift(gray: npt.NDArray[np.uint8], first_octave: int) -> Features:
     pycolmap = load_pycolmap()
+    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)  # also in a process
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size = MAX_SIDE_PX
     options.use_gpu = False
     options.num_threads = 1
+    options.sift.first_octave = first_octave
     extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
     found, descriptors = extractor.extract(pycolmap.Bitmap.from_array(gray))
     rows = [(p.x, p.y, p.a11, p.a12, p.a21, p.a22) for p in found]
-    return np.array(rows, dtype=np.float32).reshape(-1, 6), np.asarray(descriptors.data)
+    keypoints = np.array(rows, dtype=np.float32).reshape(-1, 6)
+    largest = np.sort(np.argsort(-feature_areas(keypoints), kind="stable")[:MAX_FEATURES])
+    return keypoints[largest], np.asarray(descriptors.data)[largest]
 
 
-@contextlib.contextmanager
-def _sift_process() -> Iterator[Extract]:
-    """A process that extracts features of one photo at a time."""
-    command = [sys.executable, "-c", "from igsr.cameras.colmap.features import serve; serve()"]
-    path = str(Path(__file__).resolve().parents[3])
-    environment = {**os.environ, "PYTHONPATH": path}
-    with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment
-    ) as process:
-        assert process.stdin is not None
-        assert process.stdout is not None
-        sent, received = process.stdin, process.stdout
-
-        def extract(gray: npt.NDArray[np.uint8]) -> Features:
-            try:
-                pickle.dump(gray, sent)
-                sent.flush()
-                features: Features = pickle.load(received)
-                return features
-            except (OSError, EOFError, pickle.UnpicklingError) as error:
-                raise IgsrError(
-                    "Finding features ended early; the machine may have run out of memory."
-                ) from error
-
-        yield extract
-
-
-def serve() -> None:
-    """Extract features of pickled arrays from stdin until it ends; write them to stdout."""
-    pycolmap = load_pycolmap()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process by its stdin
-    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
-    while True:
-        try:
-            gray = pickle.load(sys.stdin.buffer)
-        except EOFError:
-            return
-        pickle.dump(_sift(gray), sys.stdout.buffer)
-        sys.stdout.buffer.flush()
+def feature_areas(keypoints: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """The areas [N] of features, in square pixels up to a factor, from keypoints [N, 6]."""
+    areas: npt.NDArray[np.float32] = np.abs(np.linalg.det(keypoints[:, 2:].reshape(-1, 2, 2)))
+    return areas

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,8 @@ from igsr._internal.load_pycolmap import load_pycolmap
 from igsr.cameras.colmap.database import known_cameras
 from igsr.cameras.estimate import Progress
 
+#: Minimum number of photos to find lens distortion.
+MIN_DISTORTION_PHOTOS = 4
 #: Lens distortion is dropped if the squared error grows by at most this factor: photos that are not
 #: resampled stay sharp, and from few photos distortion is often a wrong focal length.
 MAX_ERROR_FACTOR = 1.02
@@ -53,6 +56,34 @@ def map_photos(
     return max(all_models, key=lambda m: (m.num_reg_images(), m.num_points3D()), default=None)
 
 
+def map_globally(database: Path, thresholds: Thresholds, seed: int) -> Any | None:
+    """Return a model of the global mapper, or None if it finds none.
+
+    It averages the rotations of all pairs before it places any photo (Pan et al., "Global
+    Structure-from-Motion Revisited", ECCV 2024), so no first pair leads it astray.
+    """
+    pycolmap = load_pycolmap()
+    options = pycolmap.GlobalPipelineOptions()
+    options.random_seed, options.num_threads, options.multiple_models = seed, 1, False
+    options.min_model_size = 2
+    mapper = options.mapper
+    mapper.random_seed, mapper.num_threads = seed, 1
+    for part in (mapper.rotation_averaging, mapper.global_positioning, mapper.retriangulation):
+        part.random_seed = seed
+    # As the incremental mapper at these thresholds.
+    mapper.track_min_num_views_per_track = mapper.global_positioning.min_num_view_per_track = 2
+    mapper.bundle_adjustment.min_track_length = 2
+    mapper.retriangulation.ignore_two_view_tracks = False
+    mapper.min_tri_angle_deg = thresholds.filter_min_tri_angle
+    mapper.bundle_adjustment.ceres.solver_options.num_threads = 1
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            models = pycolmap.global_mapping(database, folder, folder, options)
+        except (RuntimeError, ValueError):  # too few pairs
+            return None
+    return max(models.values(), key=lambda m: m.num_reg_images(), default=None)
+
+
 def extend(
     model: Any, count: int, database: Path, thresholds: Thresholds, seed: int, show: Progress
 ) -> None:
@@ -67,13 +98,7 @@ def extend(
         mapper.begin_reconstruction(model)
         for image in sorted(model.reg_image_ids()):
             mapper.triangulate_image(triangulation, image)
-        mapper.iterative_global_refinement(
-            options.ba_global_max_refinements,
-            options.ba_global_max_refinement_change,
-            mapper_options,
-            options.get_global_bundle_adjustment(),
-            triangulation,
-        )
+        mapper.filter_points(mapper_options)
         mapper.end_reconstruction(False)
         pipeline.reconstruct_sub_model(mapper, mapper_options, model)
         mapper.end_reconstruction(False)
@@ -94,8 +119,10 @@ def mapping_options(count: int, thresholds: Thresholds, seed: int, database: Pat
     options.mapper.filter_min_tri_angle = thresholds.filter_min_tri_angle
     options.triangulation.ignore_two_view_tracks = thresholds.ignore_two_view_tracks
     options.triangulation.min_angle = thresholds.filter_min_tri_angle
-    # Two photos cannot improve the focal length of EXIF or of the fundamental matrix.
-    options.ba_refine_focal_length = options.ba_refine_extra_params = count > 2
+    # Two photos cannot improve the focal length of EXIF or of the fundamental matrix; a few more do
+    # not tell lens distortion from focal length.
+    options.ba_refine_focal_length = count > 2
+    options.ba_refine_extra_params = count >= MIN_DISTORTION_PHOTOS
     options.constant_cameras = known_cameras(database)
     options.ba_refine_sensor_from_rig = False
     return options

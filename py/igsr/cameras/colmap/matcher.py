@@ -1,11 +1,11 @@
-"""Custom matchers: their interface, and their matches in COLMAP's database."""
+"""Matchers other than SIFT: their interface, and their matches in COLMAP's database."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -13,11 +13,13 @@ import numpy.typing as npt
 from igsr._internal.load_pycolmap import load_pycolmap
 from igsr.cameras.colmap.database import image_id, photo_file
 from igsr.cameras.colmap.features import usable_pixels
-from igsr.cameras.colmap.pairs import MAX_EXHAUSTIVE_PHOTOS
+from igsr.cameras.colmap.pairs import similar_pairs
 from igsr.cameras.estimate import Progress
 from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
 
+#: Number of a photo's first features with which each pair of photos is matched.
+BEST_FEATURES = 1024
 #: Minimum number of matches of a pair for verification (COLMAP's number of inliers).
 MIN_MATCHES = 15
 
@@ -59,71 +61,82 @@ class Matcher(Protocol):
         """Return pairs of feature indices [M, 2]; no feature is in two pairs."""
 
 
-def checked_matcher(matcher: Matcher | None) -> Matcher | None:
-    """Check that a custom matcher has a name.
-
-    Raises:
-        IgsrError: it has none.
-    """
-    if matcher is not None and not isinstance(getattr(matcher, "name", None), str):
-        raise IgsrError("matcher needs an attribute name, by which found cameras are kept")
-    return matcher
-
-
-def matched_by(
+def add_matches(
     matcher: Matcher, photos: Sequence[Photo], database: Path, seed: int, show: Progress
-) -> Path:
-    """Match all pairs of photos by a matcher, and verify the matches.
+) -> None:
+    """Match photos by a matcher, and verify its matches together with those of the database.
 
     Args:
         matcher: of features.
         photos: of the database.
-        database: without features; it is changed.
+        database: without verified matches; it is changed. The new keypoints follow those of SIFT.
         seed: of the verification.
-        show: called with "features" and "matching", done and total.
-
-    Returns:
-        The database.
+        show: called with "learned features" and "learned matches", done and total.
 
     Raises:
-        IgsrError: there are too many photos for all pairs, or the matcher's arrays are invalid.
+        IgsrError: the matcher's arrays are invalid.
     """
     pycolmap = load_pycolmap()
     count = len(photos)
-    if count > MAX_EXHAUSTIVE_PHOTOS:
-        raise IgsrError(
-            f"matcher {matcher.name} compares every pair of photos: give at most "
-            f"{MAX_EXHAUSTIVE_PHOTOS} of the {count} photos, or leave the matcher out"
-        )
     features = []
     for index, photo in enumerate(photos):
-        show("features", index, count)
+        show("learned features", index, count)
         features.append(_features(matcher, photo))
-    show("features", count, count)
-    pairs = [(a, b) for a in range(count) for b in range(a + 1, count)]
-    matched = []
+    show("learned features", count, count)
+    pairs = [
+        (a, b)
+        for a, b in similar_pairs([one.descriptors for one in features])
+        # The views of a panorama have one center.
+        if (place := photos[a].place) is None or place.rig != getattr(photos[b].place, "rig", None)
+    ]
     with pycolmap.Database.open(database) as opened:
-        for index, of_photo in enumerate(features):
-            opened.write_keypoints(image_id(index), of_photo.xy)
+        first = [_add_keypoints(opened, i, one.xy) for i, one in enumerate(features)]
         for done, (a, b) in enumerate(pairs):
-            show("matching", done, len(pairs))
+            show("learned matches", done, len(pairs))
             matches = _matches(matcher, features[a], features[b])
-            if len(matches) >= MIN_MATCHES:
-                opened.write_matches(image_id(a), image_id(b), matches)
-                matched.append(f"{photo_file(a)} {photo_file(b)}\n")
-    show("matching", len(pairs), len(pairs))
+            if len(matches):
+                ids = image_id(a), image_id(b)
+                matches += np.array([first[a], first[b]], dtype=np.uint32)
+                if opened.exists_matches(*ids):
+                    matches = np.vstack([opened.read_matches(*ids), matches])
+                    opened.delete_matches(*ids)
+                opened.write_matches(*ids, matches)
+        matched = sorted(opened.read_all_matches()[0])
+    show("learned matches", len(pairs), len(pairs))
     if matched:
         listing = database.with_name("pairs.txt")
-        listing.write_text("".join(matched))
+        names = [
+            " ".join(photo_file(n - image_id(0)) for n in pycolmap.pair_id_to_image_pair(pair))
+            for pair in matched
+        ]
+        listing.write_text("\n".join(names) + "\n")
         verification = pycolmap.TwoViewGeometryOptions()
         verification.ransac.random_seed = seed
         pycolmap.verify_matches(database, listing, verification)
-    return database
+
+
+def _add_keypoints(opened: Any, index: int, xy: npt.NDArray[np.float32]) -> int:
+    """Add keypoints [N, 2] to those of a photo; return the number of these."""
+    number = image_id(index)
+    if not opened.exists_keypoints(number):
+        opened.write_keypoints(number, xy)
+        return 0
+    before = opened.read_keypoints(number)
+    added = np.zeros((len(xy), before.shape[1]), dtype=np.float32)
+    added[:, :2] = xy
+    opened.update_keypoints(number, np.vstack([before, added]))
+    return len(before)
 
 
 def _features(matcher: Matcher, photo: Photo) -> PhotoFeatures:
     """Features of a photo's usable pixels."""
-    features = matcher.features(np.ascontiguousarray(photo.image[..., :3]))
+    image = np.ascontiguousarray(photo.image[..., :3])
+    usable = usable_pixels(photo)
+    if usable is not None:
+        # Masked pixels must not take features from the others.
+        image = image.copy()
+        image[~usable] = image[usable].mean(axis=0).round() if usable.any() else 0
+    features = matcher.features(image)
     xy = np.asarray(features.xy, dtype=np.float32)
     height, width = photo.image.shape[:2]
     if xy.ndim != 2 or xy.shape[1] != 2 or len(features.descriptors) != len(xy):
@@ -134,7 +147,6 @@ def _features(matcher: Matcher, photo: Photo) -> PhotoFeatures:
     inside = np.isfinite(xy).all(axis=1) & (xy >= 0.0).all(axis=1)
     inside &= (xy[:, 0] < width) & (xy[:, 1] < height)
     column, row = np.where(inside[:, None], xy, 0.0).astype(np.int64).T
-    usable = usable_pixels(photo)
     if usable is not None:
         inside &= usable[row, column]
     return PhotoFeatures(xy, features.descriptors, features.size).kept(inside)

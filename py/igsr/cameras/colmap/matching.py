@@ -8,39 +8,52 @@ initial focal length is the most common failure.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Collection
+from collections.abc import Collection, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from igsr._internal.load_pycolmap import load_pycolmap
 from igsr.cameras.colmap.database import image_id, photo_file
 from igsr.cameras.colmap.guided_matching import (
     Constraint,
     EpipolarLine,
-    Features,
     Plane,
     comparable,
     guided_matches,
 )
 from igsr.cameras.colmap.pairs import in_tiles, pairs_to_match
+from igsr.cameras.colmap.processes import process_count, processes
 from igsr.cameras.estimate import Progress
+
+#: Features of a photo: places [N, 2] in pixels, and descriptors uint8 [N, 128].
+Described: TypeAlias = tuple[npt.NDArray[np.float32], npt.NDArray[np.uint8]]
 
 #: Pairs between two progress reports.
 PAIRS_PER_REPORT = 8
+#: Begins the names of databases with estimated focal lengths.
+CALIBRATED = "calibrated_"
+#: Usual focal lengths, in units of the longer side (diagonal fields of view of 110 to 23 degrees).
+MIN_FOCAL = 0.4
+MAX_FOCAL = 3.0
+#: With fewer pairs, one process is faster.
+MIN_PARALLEL_PAIRS = 16
 #: Maximum distance of a match to its epipolar line, pixels (COLMAP's).
 MAX_DISTANCE_PX = 4.0
 
 
-def matched(count: int, features: Path, seed: int, show: Progress) -> Path:
-    """Copy a database of features and add geometrically verified matches.
+def matched(count: int, features: Path, seed: int, show: Progress, *, verify: bool = True) -> Path:
+    """Copy a database of features and add matches.
 
     Args:
         count: number of photos.
         features: the database.
         seed: of the verification.
         show: called with "matching", done and total pairs.
+        verify: verify the matches geometrically.
 
     Returns:
         The new database in the same folder, with unchanged focal lengths.
@@ -51,6 +64,7 @@ def matched(count: int, features: Path, seed: int, show: Progress) -> Path:
     pairs = pairs_to_match(count, database)
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
+    matching.skip_geometric_verification = not verify
     # The views of a panorama have one center and different directions.
     matching.skip_image_pairs_in_same_frame = True
     verification = pycolmap.TwoViewGeometryOptions()
@@ -76,14 +90,70 @@ def matched(count: int, features: Path, seed: int, show: Progress) -> Path:
 
 
 def with_focal_lengths(matches: Path, seed: int) -> Path:
-    """Copy a database of matches and estimate focal lengths from all its pairs."""
+    """Copy a database of matches and estimate focal lengths from all its pairs.
+
+    Where pairs show little but a plane, the estimate may be far off. Focal lengths that no usual
+    lens has stay as they were: the mapper starts from twice the right one without harm.
+    """
     pycolmap = load_pycolmap()
-    database = matches.with_name(f"calibrated_{matches.name}")
+    database = matches.with_name(f"{CALIBRATED}{matches.name}")
     shutil.copyfile(matches, database)
     calibration = pycolmap.ViewGraphCalibrationOptions()
     calibration.random_seed = seed
+    with pycolmap.Database.open(database) as opened:
+        before = {camera.camera_id: camera for camera in opened.read_all_cameras()}
     pycolmap.calibrate_view_graph(database, calibration)
+    with pycolmap.Database.open(database) as opened:
+        for camera in opened.read_all_cameras():
+            focal = camera.params[0] / max(camera.width, camera.height)
+            if not MIN_FOCAL <= focal <= MAX_FOCAL:
+                opened.update_camera(before[camera.camera_id])
     return database
+
+
+def with_other_focal_lengths(database: Path, focals: Sequence[float]) -> Iterator[Path]:
+    """Copy a database with other focal lengths for cameras without a prior one.
+
+    Args:
+        database: from ``with_focal_lengths``.
+        focals: in units of the longer side; a copy is made for each if it changes a camera.
+    """
+    pycolmap = load_pycolmap()
+    known = _known_focals(database)
+    for focal in focals:
+        copied = database.with_name(f"focal_{focal}_{database.name}")
+        shutil.copyfile(database, copied)
+        changed = False
+        with pycolmap.Database.open(copied) as opened:
+            for camera in opened.read_all_cameras():
+                length = focal * max(camera.width, camera.height)
+                if camera.camera_id not in known and length != camera.params[0]:
+                    camera.params = [length, *camera.params[1:]]
+                    opened.update_camera(camera)
+                    changed = True
+        if changed:
+            yield copied
+
+
+def has_usual_focals(model: Any, database: Path) -> bool:
+    """Whether a model's focal lengths are usual ones, except those of EXIF.
+
+    A few photos from far away look alike for all long focal lengths; the mapper may end at any.
+    """
+    known = _known_focals(database)
+    return all(
+        camera.camera_id in known
+        or MIN_FOCAL <= camera.mean_focal_length() / max(camera.width, camera.height) <= MAX_FOCAL
+        for camera in model.cameras.values()
+    )
+
+
+def _known_focals(database: Path) -> set[int]:
+    """Ids of cameras whose focal length was known before ``with_focal_lengths``."""
+    pycolmap = load_pycolmap()
+    source = database.with_name(database.name.partition(CALIBRATED)[2])
+    with pycolmap.Database.open(source) as opened:
+        return {c.camera_id for c in opened.read_all_cameras() if c.has_prior_focal_length}
 
 
 def with_matches(matches: Path) -> set[int]:
@@ -122,23 +192,39 @@ def matched_along_lines(matches: Path, wanted: Collection[int], show: Progress) 
             constraint = _constraint(geometry)
             if constraint is not None and (a in images or b in images):
                 pairs.append((a, b, geometry, constraint))
-        features: dict[int, Features] = {}
-        for done, (a, b, geometry, constraint) in enumerate(pairs):
+        features: dict[int, Described] = {}
+        for image in {image for pair in pairs for image in pair[:2]}:
+            descriptors = np.asarray(opened.read_descriptors(image).data)
+            features[image] = opened.read_keypoints(image)[:, :2], descriptors
+        found = _guided([(features[a], features[b], rule) for a, b, _, rule in pairs])
+        for done, ((a, b, geometry, _), inliers) in enumerate(zip(pairs, found, strict=True)):
             if done % PAIRS_PER_REPORT == 0:
                 show("matching", done, len(pairs))
-            for image in {a, b} - features.keys():
-                features[image] = comparable(
-                    opened.read_keypoints(image)[:, :2], opened.read_descriptors(image).data
-                )
-            inliers = guided_matches(features[a], features[b], constraint)
+            counts = [len(features[image][1]) for image in (a, b)]
+            others = (geometry.inlier_matches >= counts).any(axis=1)
+            inliers = np.vstack([inliers, geometry.inlier_matches[others]])
             if len(inliers) > len(geometry.inlier_matches):
                 geometry.inlier_matches = inliers
                 opened.update_two_view_geometry(a, b, geometry)
                 gained = True
-            # Bounds memory: pairs are ordered by their first photo.
-            features = {image: kept for image, kept in features.items() if image == a}
         show("matching", len(pairs), len(pairs))
     return database if gained else None
+
+
+def _guided(
+    pairs: Sequence[tuple[Described, Described, Constraint]],
+) -> Iterator[npt.NDArray[np.uint32]]:
+    """The guided matches of each pair, in order."""
+    count = process_count()
+    if count == 1 or len(pairs) < MIN_PARALLEL_PAIRS:
+        yield from (_matches(*pair) for pair in pairs)
+        return
+    with processes(count) as call, ThreadPoolExecutor(count) as pool:
+        yield from pool.map(lambda pair: call(_matches, *pair), pairs)
+
+
+def _matches(first: Described, second: Described, constraint: Constraint) -> npt.NDArray[np.uint32]:
+    return guided_matches(comparable(*first), comparable(*second), constraint)
 
 
 def _constraint(geometry: Any) -> Constraint | None:

@@ -14,12 +14,16 @@ import numpy.typing as npt
 
 from igsr._internal.load_pycolmap import load_pycolmap
 from igsr.cameras.colmap.database import photo_file
+from igsr.cameras.colmap.features import feature_areas
 
 #: Maximum number of photos for matching every pair.
 MAX_EXHAUSTIVE_PHOTOS = 60
 #: Of more photos, each is matched with this many that follow it and that are similar.
 FOLLOWING_PHOTOS = 8
 SIMILAR_PHOTOS = 16
+#: The same for learned matches, which take longer.
+MAX_EXHAUSTIVE_LEARNED = 12
+SIMILAR_LEARNED = 12
 #: Number of largest features for finding similar photos, and the minimum matches of these.
 PRESELECTION_FEATURES = 128
 MIN_PRESELECTION_MATCHES = 4
@@ -44,6 +48,28 @@ def pairs_to_match(count: int, database: Path) -> list[tuple[int, int]]:
     return sorted(pairs)
 
 
+def similar_pairs(descriptors: Sequence[npt.NDArray[np.float32]]) -> list[tuple[int, int]]:
+    """Return the pairs of photos for a learned matcher, as indices.
+
+    Args:
+        descriptors: [N, D] of each photo, the best first.
+    """
+    count = len(descriptors)
+    if count <= MAX_EXHAUSTIVE_LEARNED:
+        return [(a, b) for a in range(count) for b in range(a + 1, count)]
+    similar = similarity([_normalized(one[:PRESELECTION_FEATURES]) for one in descriptors])
+    pairs = set()
+    for a in range(count):
+        for b in np.argsort(-similar[a], kind="stable")[:SIMILAR_LEARNED]:
+            pairs.add((min(a, int(b)), max(a, int(b))))
+    return sorted(pair for pair in pairs if pair[0] != pair[1])
+
+
+def _normalized(descriptors: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    lengths = np.linalg.norm(descriptors, axis=1, keepdims=True)
+    return descriptors / np.maximum(lengths, 1e-9).astype(np.float32)
+
+
 def in_tiles(pairs: Sequence[tuple[int, int]]) -> list[list[tuple[int, int]]]:
     """Group pairs into tiles of ``TILE_PHOTOS`` by ``TILE_PHOTOS`` photos."""
     tiles: dict[tuple[int, int], list[tuple[int, int]]] = {}
@@ -65,18 +91,15 @@ def largest_features(count: int, database: Path) -> list[npt.NDArray[np.float32]
                 continue
             keypoints = opened.read_keypoints(image_id)
             descriptors = opened.read_descriptors(image_id).data.astype(np.float32)
-            # The determinant of a feature's affine shape is the square of its size.
-            size = np.abs(np.linalg.det(keypoints[:, 2:6].reshape(-1, 2, 2)))
-            largest = descriptors[np.argsort(-size, kind="stable")[:PRESELECTION_FEATURES]]
-            lengths = np.linalg.norm(largest, axis=1, keepdims=True)
-            largest_of.append(largest / np.maximum(lengths, 1e-9))
+            order = np.argsort(-feature_areas(keypoints), kind="stable")
+            largest_of.append(_normalized(descriptors[order[:PRESELECTION_FEATURES]]))
     return largest_of
 
 
 def similarity(descriptors: list[npt.NDArray[np.float32]]) -> npt.NDArray[np.int64]:
     """Count the mutual matches of the largest features of each pair of photos, [N, N]."""
     count, longest = len(descriptors), max(len(features) for features in descriptors)
-    padded = np.zeros((count, longest, 128), dtype=np.float32)
+    padded = np.zeros((count, longest, descriptors[0].shape[1]), dtype=np.float32)
     for index, features in enumerate(descriptors):
         padded[index, : len(features)] = features
     counts = np.zeros((count, count), dtype=np.int64)

@@ -12,7 +12,7 @@ import numpy as np
 from igsr._internal.name_lists import listed
 from igsr.cameras.all_evidence import Evidence, with_all_evidence
 from igsr.cameras.checkpoint_search import find_checkpoint
-from igsr.cameras.colmap.matcher import Matcher, checked_matcher
+from igsr.cameras.colmap.matchers import AUTO, Choice, chosen_matchers
 from igsr.cameras.da3.checkpoint import LICENSE, SIZES, load_network
 from igsr.cameras.da3.passes import joined_passes, passes_of
 from igsr.cameras.da3.prediction import Da3Predictor, Predictor
@@ -52,12 +52,12 @@ class Da3:
         predictor: Predictor | None = None,
         checkpoint: str | os.PathLike[str] | None = None,
         bundle_adjustment: bool = True,
-        matcher: Matcher | None = None,
+        matcher: Choice = AUTO,
     ) -> None:
         self.predictor = predictor
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
         self.bundle_adjustment = bundle_adjustment
-        self.matcher = checked_matcher(matcher)
+        self.matchers = chosen_matchers(matcher)
 
     def __call__(
         self,
@@ -97,7 +97,7 @@ class Da3:
         if self.bundle_adjustment:
             confident = [None if one is None else confident_pixels(one) for one in aligned]
             evidence = with_all_evidence(
-                photos, aligned, confident, NETWORK, self.matcher, seed, progress
+                photos, aligned, confident, NETWORK, self.matchers, seed, progress
             )
         estimate = self._estimate(photos, aligned, evidence)
         estimate.warnings = self._warnings(photos, aligned, lost, evidence)
