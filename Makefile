@@ -1,4 +1,4 @@
-# make setup  installs what the tests need with apt: a software Vulkan driver, a browser, shader tools
+# make setup  installs what the tests need with apt: a software Vulkan driver, a browser, shader tools, libGL
 # make test   runs the checks: about eight minutes on two cores once built
 # make test-long   runs the tests that take longer
 # make demo   makes a scene of the example photos in out/demo
@@ -156,9 +156,10 @@ check-python: build $(VENV)/.dev-ready
 # ---- system packages ---------------------------------------------------------------------------
 
 # Vulkan on the CPU where there is no GPU; a display for the viewer's window, with a fake mouse;
-# readers of the shaders that naga's authors did not write; a browser for pages.
+# readers of the shaders that naga's authors did not write; a browser for pages; what OpenCV links.
 SYSTEM_PACKAGES := python3-venv mesa-vulkan-drivers libvulkan1 xvfb xdotool libx11-6 libx11-xcb1 \
-	libxcursor1 libxi6 libxrandr2 libxkbcommon-x11-0 spirv-tools glslang-tools chromium
+	libxcursor1 libxi6 libxrandr2 libxkbcommon-x11-0 spirv-tools glslang-tools chromium \
+	libgl1
 
 setup:
 	@command -v apt-get >/dev/null || { \
@@ -179,6 +180,7 @@ check-system:
 		need "xvfb" "command -v Xvfb"; need "xdotool" "command -v xdotool"; \
 		need "libxkbcommon-x11-0" "lib libxkbcommon-x11.so.0"; \
 		need "libxcursor1" "lib libXcursor.so.1"; need "libxi6" "lib libXi.so.6"; \
+		need "libgl1" "lib libGL.so.1"; \
 		need "spirv-tools" "command -v spirv-val"; \
 		need "glslang-tools" "command -v glslangValidator"; \
 	fi; \

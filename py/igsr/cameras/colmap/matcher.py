@@ -81,7 +81,7 @@ def add_matches(
     features = []
     for index, photo in enumerate(photos):
         show("learned features", index, count)
-        features.append(_features(matcher, photo))
+        features.append(usable_features(matcher, photo))
     show("learned features", count, count)
     pairs = [
         (a, b)
@@ -93,7 +93,7 @@ def add_matches(
         first = [_add_keypoints(opened, i, one.xy) for i, one in enumerate(features)]
         for done, (a, b) in enumerate(pairs):
             show("learned matches", done, len(pairs))
-            matches = _matches(matcher, features[a], features[b])
+            matches = checked_matches(matcher, features[a], features[b])
             if len(matches):
                 ids = image_id(a), image_id(b)
                 matches += np.array([first[a], first[b]], dtype=np.uint32)
@@ -128,7 +128,7 @@ def _add_keypoints(opened: Any, index: int, xy: npt.NDArray[np.float32]) -> int:
     return len(before)
 
 
-def _features(matcher: Matcher, photo: Photo) -> PhotoFeatures:
+def usable_features(matcher: Matcher, photo: Photo) -> PhotoFeatures:
     """Features of a photo's usable pixels."""
     image = np.ascontiguousarray(photo.image[..., :3])
     usable = usable_pixels(photo)
@@ -152,7 +152,7 @@ def _features(matcher: Matcher, photo: Photo) -> PhotoFeatures:
     return PhotoFeatures(xy, features.descriptors, features.size).kept(inside)
 
 
-def _matches(
+def checked_matches(
     matcher: Matcher, first: PhotoFeatures, second: PhotoFeatures
 ) -> npt.NDArray[np.uint32]:
     """Match two photos and check the indices: COLMAP would read beyond its arrays."""

@@ -7,7 +7,7 @@ The points of each initialization are
   photos have none, of depth maps by stereo (``depth_maps``) and, of few photos, "sift";
 * "hull": in the visual hull of photos with alpha (``visual_hull``);
 * "rays": on rays of photo pixels, at the depth where other photos agree best (``ray_depths``);
-* "sift": triangulated features and points between them (``sift_points``);
+* "sift": triangulated matches and points between them (``matched_points``);
 * "random": in the box that the cameras look at.
 
 "auto" chooses the first that applies: depths if half of the photos have depth maps; points if there
@@ -27,9 +27,9 @@ from igsr.capture import Capture, Points, View
 from igsr.errors import IgsrError
 from igsr.fitting.initialization.depth_maps import depth_points, have_neighbors, viewed_target
 from igsr.fitting.initialization.given_depths import given_points, have_depths
+from igsr.fitting.initialization.matched_points import matched_points, with_points_between
 from igsr.fitting.initialization.photo_pixels import at_most
 from igsr.fitting.initialization.ray_depths import ray_points
-from igsr.fitting.initialization.sift_points import sift_points, with_points_between
 from igsr.fitting.initialization.visual_hull import hull_points, viewed_box
 from igsr.fitting.settings import Initialization
 from igsr.splats import Splats
@@ -165,7 +165,7 @@ def _initial_splats(
                 "to start from; use start auto or random."
             )
         start = "points" if points is not None and len(points.xyz) >= MIN_POINTS else "sift"
-    features = sift_points(views) if start == "sift" else None
+    features = matched_points(views) if start == "sift" else None
     if features is not None and len(features[0]) < MIN_FEATURES:
         if asked != "auto":
             raise IgsrError(
@@ -214,7 +214,7 @@ def _with_depths(
     else:
         seeds = known
         if not len(known) and len(views) <= MAX_JOINED_PHOTOS:
-            features = sift_points(views)
+            features = matched_points(views)
             if len(features[0]) >= MIN_FEATURES:
                 count = min(wanted // 2, DEFAULT_SPLATS, SPLATS_PER_FEATURE * len(features[0]))
                 seeds = features[0]

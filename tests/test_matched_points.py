@@ -12,13 +12,13 @@ from made_up_tracks import projected
 
 from igsr.capture import Camera, Capture, View
 from igsr.errors import IgsrError
-from igsr.fitting.initialization import sift_points as module
+from igsr.fitting.initialization import matched_points as module
 from igsr.fitting.initialization.initial_splats import (
     SPLATS_PER_FEATURE,
     chosen_start,
     initial_splats,
 )
-from igsr.fitting.initialization.sift_points import sift_points
+from igsr.fitting.initialization.matched_points import matched_points
 
 SIZE = 120
 NORMAL = np.array([0.4, 0.2, -1.0]) / np.linalg.norm([0.4, 0.2, -1.0])
@@ -58,13 +58,13 @@ def photos():
 
 @pytest.fixture(scope="module")
 def found(photos):
-    return sift_points(photos)
+    return matched_points(photos)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_points_are_on_the_surface_with_its_colors(capfd, seed):
     views = [photo(angle, seed) for angle in (-0.15, 0.0, 0.15)]
-    xyz, colors = sift_points(views)
+    xyz, colors = matched_points(views)
     assert len(xyz) == len(colors) > 100
     # A pixel is 0.02 wide there and 20 times as deep.
     assert np.quantile(np.abs(xyz @ NORMAL), 0.9) < 0.05
@@ -72,7 +72,7 @@ def test_points_are_on_the_surface_with_its_colors(capfd, seed):
     inside = (np.minimum(column, row) >= 0) & (np.maximum(column, row) < SIZE)
     seen = views[1].image[row[inside], column[inside]] / 255.0
     assert np.abs(seen - colors[inside]).mean() < 0.05
-    np.testing.assert_array_equal(sift_points(views)[0], xyz)
+    np.testing.assert_array_equal(matched_points(views)[0], xyz)
     assert capfd.readouterr() == ("", "")
 
 
@@ -88,7 +88,7 @@ def test_hidden_pixels_have_no_points_and_do_not_matter(photos, found):
             if alpha:
                 image = np.dstack([image, np.where(shown, 255, 0).astype(np.uint8)])
             hidden.append(replace(view, image=image, mask=None if alpha else shown))
-        return sift_points(hidden)[0]
+        return matched_points(hidden)[0]
 
     masked = points(0, alpha=False)
     assert len(masked) > len(found[0]) / 4
@@ -116,7 +116,7 @@ def rolled(view):
     ],
 )
 def test_photos_without_matches_have_hardly_any_points(photos, change):
-    xyz, colors = sift_points(change(photos))
+    xyz, colors = matched_points(change(photos))
     assert xyz.shape == colors.shape == (len(xyz), 3)
     assert len(xyz) < 5
 
@@ -132,18 +132,18 @@ def test_large_photos_are_reduced(photos, found, monkeypatch, alpha):
         K = view.camera.K * [[3.0], [3.0], [1.0]]
         camera = Camera(view.camera.viewmat, K, 3 * SIZE, 3 * SIZE)
         large.append(View(view.name, camera, "train", image))
-    xyz, colors = sift_points(large)
+    xyz, colors = matched_points(large)
     np.testing.assert_allclose(xyz, found[0], atol=1e-9)
     np.testing.assert_allclose(colors, found[1], atol=1e-9)
     monkeypatch.setattr(module, "MAX_SIDE_PX", 1)
-    assert len(sift_points(large)[0]) == 0
+    assert len(matched_points(large)[0]) == 0
 
 
 def test_holes_in_masks_are_no_features(photos):
     """Filled with one gray level, holes look like blobs."""
     row, column = np.indices((SIZE, SIZE))
     mask = (row % 24 > 6) | (column % 24 > 6)
-    xyz, _ = sift_points([replace(view, mask=mask) for view in photos])
+    xyz, _ = matched_points([replace(view, mask=mask) for view in photos])
     assert len(xyz) > 10
     assert np.quantile(np.abs(xyz @ NORMAL), 0.9) < 0.05
 
@@ -158,7 +158,7 @@ def test_only_consistent_tracks_become_points(photos, monkeypatch):
     each = iter(pixels)
     features = np.eye(6, 128, dtype=np.float32)
     monkeypatch.setattr(module, "_features", lambda view: (next(each), features))
-    points, colors = sift_points(photos)
+    points, colors = matched_points(photos)
     order = np.linalg.norm(points[:, None] - xyz, axis=2).argmin(axis=1)
     assert sorted(order) == [2, 3, 4, 5]
     np.testing.assert_allclose(points, xyz[order], atol=1e-9)

@@ -1,8 +1,9 @@
-"""Triangulated SIFT features of photos with known poses.
+"""Triangulated matches of photos with known poses.
 
-Such points are few but right, also in photos from far apart. Features (Lowe 2004) of the nearest
-photos are matched by their descriptors; matches must agree with the poses, by epipolar distance and
-reprojection error.
+Such points are few but right, also in photos from far apart. SIFT features (Lowe 2004) of the
+nearest photos are matched by their descriptors, and if the extra ``matching`` is installed, ALIKED
+features by LightGlue. Matches must agree with the poses, by epipolar distance and reprojection
+error.
 """
 
 from __future__ import annotations
@@ -14,7 +15,11 @@ import numpy as np
 import numpy.typing as npt
 
 from igsr._internal.load_pycolmap import load_pycolmap
+from igsr.cameras.colmap import aliked
+from igsr.cameras.colmap.aliked import Aliked
+from igsr.cameras.colmap.matcher import checked_matches, usable_features
 from igsr.capture import Camera, View
+from igsr.capture.photo_folder import Photo
 from igsr.fitting.initialization.photo_pixels import by_distance, camera_centers
 
 Float64 = npt.NDArray[np.float64]
@@ -39,8 +44,8 @@ MIN_ANGLE_DEG = 2.0
 NEIGHBORS = 5
 
 
-def sift_points(views: list[View]) -> tuple[Float64, Float64]:
-    """Return triangulated features of photos; deterministic.
+def matched_points(views: list[View]) -> tuple[Float64, Float64]:
+    """Return triangulated matches of photos; deterministic.
 
     Args:
         views: the photos; masked and fully transparent pixels have no features.
@@ -49,21 +54,29 @@ def sift_points(views: list[View]) -> tuple[Float64, Float64]:
         Points [P, 3] in the world frame and their mean colors [P, 3] in 0..1; P may be 0.
     """
     views = [_reduced(view) for view in views]
+    photo_pairs = _photo_pairs(views)
     features = [_features(view) for view in views]
-    counts = [len(pixels) for pixels, _ in features]
-    first = np.cumsum([0, *counts])
-    matches = [
-        first[[a, b]] + _matches(views[a], features[a], views[b], features[b])
-        for a, b in _photo_pairs(views)
-    ]
+    places = [pixels for pixels, _ in features]
+    found = [_matches(features[a], features[b]) for a, b in photo_pairs]
+    if aliked.is_available():
+        matcher = Aliked()
+        photos = [Photo(view.name, view.image, mask=view.mask) for view in views]
+        learned = [usable_features(matcher, photo) for photo in photos]
+        places += [one.xy.astype(np.float64) for one in learned]
+        found += [checked_matches(matcher, learned[a], learned[b]) for a, b in photo_pairs]
+    first = np.cumsum([0, *map(len, places)])
+    matches = [np.zeros((0, 2), dtype=np.int64)]
+    for k, rows in enumerate(found):
+        a, b = photo_pairs[k % len(photo_pairs)]
+        i, j = (len(views) * (k // len(photo_pairs)) + n for n in (a, b))
+        error = _epipolar_distance(views[a], places[i][rows[:, 0]], views[b], places[j][rows[:, 1]])
+        matches.append(first[[i, j]] + rows[error < 2 * MAX_ERROR_PX].astype(np.int64))
     # A corner can be two features with different orientations: use each position once.
-    photo = np.repeat(np.arange(len(views)), counts)
+    photo = np.repeat(np.arange(len(places)) % len(views), [len(pixels) for pixels in places])
     positions, position = np.unique(
-        np.column_stack([photo, np.concatenate([pixels for pixels, _ in features])]),
-        axis=0,
-        return_inverse=True,
+        np.column_stack([photo, np.concatenate(places)]), axis=0, return_inverse=True
     )
-    pairs = position.reshape(-1)[np.concatenate([np.zeros((0, 2), dtype=np.int64), *matches])]
+    pairs = position.reshape(-1)[np.concatenate(matches)]
     track = _tracks(pairs, len(positions))
     view_of, pixels = positions[:, 0].astype(np.int64), positions[:, 1:]
     used = np.unique(pairs)
@@ -143,8 +156,8 @@ def _photo_pairs(views: list[View]) -> list[tuple[int, int]]:
     return sorted(pairs)
 
 
-def _matches(a: View, features_a: Features, b: View, features_b: Features) -> Int64:
-    """Pairs [M, 2] of features that are each other's best match and agree with the poses."""
+def _matches(features_a: Features, features_b: Features) -> Int64:
+    """Pairs [M, 2] of features that are each other's best match."""
     if min(len(features_a[0]), len(features_b[0])) < 2:
         return np.zeros((0, 2), dtype=np.int64)
     similarity = features_a[1] @ features_b[1].T
@@ -154,9 +167,7 @@ def _matches(a: View, features_a: Features, b: View, features_b: Features) -> In
     best_two = np.partition(similarity, -2, axis=1)[:, -2:]
     distance = np.sqrt(np.maximum(2.0 - 2.0 * best_two, 0.0))
     rows = rows[is_mutual & (distance[:, 1] < MAX_RATIO * distance[:, 0])]
-    matches = np.stack([rows, best[rows]], axis=1)
-    error = _epipolar_distance(a, features_a[0][matches[:, 0]], b, features_b[0][matches[:, 1]])
-    return matches[error < 2 * MAX_ERROR_PX]
+    return np.stack([rows, best[rows]], axis=1)
 
 
 def _epipolar_distance(a: View, pixels_a: Float64, b: View, pixels_b: Float64) -> Float64:
