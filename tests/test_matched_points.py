@@ -40,11 +40,11 @@ def texture(seed=0):
     return np.clip(picture, 0, 255)
 
 
-def photo(angle, seed=0):
+def photo(angle, seed=0, size=SIZE):
     """A photo of a slanted wall through the origin."""
-    camera = scenes.ring_camera(angle, SIZE)
-    row, column = np.indices((SIZE, SIZE)) + 0.5
-    pixels = np.stack([column, row, np.ones((SIZE, SIZE))], axis=-1)
+    camera = scenes.ring_camera(angle, size)
+    row, column = np.indices((size, size)) + 0.5
+    pixels = np.stack([column, row, np.ones((size, size))], axis=-1)
     rays = pixels @ np.linalg.inv(camera.K).T @ camera.viewmat[:3, :3]
     wall = camera.center - rays * ((camera.center @ NORMAL) / (rays @ NORMAL))[..., None]
     column, row = np.moveaxis(((wall[..., :2] + 2.5) * 100).astype(int) % 512, -1, 0)
@@ -205,3 +205,13 @@ def test_too_few_features_are_an_error_or_replaced_by_rays():
 def test_features_need_exact_poses(exact, expected):
     capture = Capture(Path("wall"), [photo(angle) for angle in (-0.45, 0.45)])
     assert initial_splats(capture, 0, 200, 0, exact_poses=exact)[1] == expected
+
+
+def test_the_trained_matcher_adds_points_of_photos_from_far_apart(with_aliked, monkeypatch):
+    far = [photo(angle, size=300) for angle in (-0.9, 0.0, 0.9)]
+    xyz, _ = matched_points(far)
+    np.testing.assert_array_equal(matched_points(far)[0], xyz)
+    monkeypatch.setattr(module.aliked, "is_available", lambda: False)
+    fewer, _ = matched_points(far)
+    assert len(xyz) > 1.3 * len(fewer)
+    assert np.quantile(np.abs(xyz @ NORMAL), 0.9) < 0.03

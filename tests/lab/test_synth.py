@@ -351,7 +351,8 @@ def test_the_command_reports_finished_scenes_and_overwrites_no_others(lone, lab_
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
     assert report["scenes"][0]["family"] == "object"
-    assert report["settings"] == {"size": 24, "views": 3, "test_views": 1, "spp": 4}
+    settings = {"size": 24, "views": 3, "test_views": 1, "spp": 4, "angle": None}
+    assert report["settings"] == settings
     assert "0 made, 1 already finished" in lab_here(*given, "24").stdout
     message = "was made with size 24, not 32; give another --out"
     assert message in lab_here(*given, "32").stderr

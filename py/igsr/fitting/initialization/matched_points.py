@@ -63,14 +63,17 @@ def matched_points(views: list[View]) -> tuple[Float64, Float64]:
         photos = [Photo(view.name, view.image, mask=view.mask) for view in views]
         learned = [usable_features(matcher, photo) for photo in photos]
         places += [one.xy.astype(np.float64) for one in learned]
-        found += [checked_matches(matcher, learned[a], learned[b]) for a, b in photo_pairs]
+        found += [
+            checked_matches(matcher, learned[a], learned[b]).astype(np.int64)
+            for a, b in photo_pairs
+        ]
     first = np.cumsum([0, *map(len, places)])
     matches = [np.zeros((0, 2), dtype=np.int64)]
     for k, rows in enumerate(found):
         a, b = photo_pairs[k % len(photo_pairs)]
         i, j = (len(views) * (k // len(photo_pairs)) + n for n in (a, b))
         error = _epipolar_distance(views[a], places[i][rows[:, 0]], views[b], places[j][rows[:, 1]])
-        matches.append(first[[i, j]] + rows[error < 2 * MAX_ERROR_PX].astype(np.int64))
+        matches.append(first[[i, j]] + rows[error < 2 * MAX_ERROR_PX])
     # A corner can be two features with different orientations: use each position once.
     photo = np.repeat(np.arange(len(places)) % len(views), [len(pixels) for pixels in places])
     positions, position = np.unique(
