@@ -20,14 +20,14 @@ collect_ignore = [] if os.environ.get("IGSR_DA3_FIXTURES") else ["test_da3_publi
 hypothesis.settings.register_profile("igsr", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("igsr")
 
-#: Matcher "auto" is SIFT in tests, which is faster, except in those that use ``with_aliked``.
+#: Matcher "auto" is SIFT in tests, which is faster; ``with_aliked`` changes that.
 aliked_is_available = aliked.is_available
 aliked.is_available = lambda: False
 
 
 @pytest.fixture
 def with_aliked(monkeypatch):
-    """Make matcher "auto" what it is for users."""
+    """Matcher "auto" uses ALIKED."""
     monkeypatch.setattr(aliked, "is_available", aliked_is_available)
 
 

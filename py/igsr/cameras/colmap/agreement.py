@@ -1,8 +1,7 @@
 """How many of the verified matches agree with a model.
 
-The mapper triangulates some of the matches and ignores the others. Two parts of a model that share
-few points can be at wrong places to each other, and photos of similar sides of an object at the
-same place: then matches that the mapper ignored disagree with the model.
+The mapper ignores many matches. If two parts of a model share few points, or if two sides of an
+object look similar, it can place photos wrongly: then the ignored matches disagree with the model.
 """
 
 from __future__ import annotations

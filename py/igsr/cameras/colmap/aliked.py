@@ -64,9 +64,8 @@ class Aliked:
                 raise
             except (ImportError, OSError, RuntimeError) as error:  # of a system library
                 raise IgsrError(
-                    f"matcher aliked: {PACKAGE} cannot be loaded ({error}); install what is "
-                    "missing (on Debian and Ubuntu libGL is the package libgl1), or use matcher "
-                    "sift"
+                    f"matcher aliked: {PACKAGE} cannot be loaded ({error}); install the "
+                    "missing library (libGL is in the Debian package libgl1), or use matcher sift"
                 ) from error
         _check_package()
         self._torch = torch

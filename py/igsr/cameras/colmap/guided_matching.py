@@ -151,7 +151,7 @@ class Features:
 
 def comparable(xy: npt.ArrayLike, descriptors: npt.NDArray[np.uint8]) -> Features:
     """Prepare features at places [N, 2] in pixels, with descriptors uint8 [N, 128]."""
-    # Keypoints of other matchers follow those with descriptors.
+    # Learned keypoints follow SIFT's and have no descriptors.
     xy = np.asarray(xy, dtype=np.float32).reshape(-1, 2)[: len(descriptors)]
     numbers = descriptors.astype(np.float32).reshape(-1, 128)
     squared = (numbers * numbers).sum(axis=1, keepdims=True)

@@ -119,8 +119,8 @@ def mapping_options(count: int, thresholds: Thresholds, seed: int, database: Pat
     options.mapper.filter_min_tri_angle = thresholds.filter_min_tri_angle
     options.triangulation.ignore_two_view_tracks = thresholds.ignore_two_view_tracks
     options.triangulation.min_angle = thresholds.filter_min_tri_angle
-    # Two photos cannot improve the focal length of EXIF or of the fundamental matrix; a few more do
-    # not tell lens distortion from focal length.
+    # Two photos cannot improve the focal length of EXIF or of the fundamental matrix; three cannot
+    # determine lens distortion.
     options.ba_refine_focal_length = count > 2
     options.ba_refine_extra_params = count >= MIN_DISTORTION_PHOTOS
     options.constant_cameras = known_cameras(database)

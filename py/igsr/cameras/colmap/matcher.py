@@ -64,12 +64,12 @@ class Matcher(Protocol):
 def add_matches(
     matcher: Matcher, photos: Sequence[Photo], database: Path, seed: int, show: Progress
 ) -> None:
-    """Match photos by a matcher, and verify its matches together with those of the database.
+    """Match photos by a matcher; verify its matches and the database's together.
 
     Args:
         matcher: of features.
         photos: of the database.
-        database: without verified matches; it is changed. The new keypoints follow those of SIFT.
+        database: without verified matches; it is changed. New keypoints follow SIFT's.
         seed: of the verification.
         show: called with "learned features" and "learned matches", done and total.
 
@@ -116,7 +116,7 @@ def add_matches(
 
 
 def _add_keypoints(opened: Any, index: int, xy: npt.NDArray[np.float32]) -> int:
-    """Add keypoints [N, 2] to those of a photo; return the number of these."""
+    """Add keypoints [N, 2] to a photo's; return the number it had before."""
     number = image_id(index)
     if not opened.exists_keypoints(number):
         opened.write_keypoints(number, xy)
@@ -133,7 +133,7 @@ def usable_features(matcher: Matcher, photo: Photo) -> PhotoFeatures:
     image = np.ascontiguousarray(photo.image[..., :3])
     usable = usable_pixels(photo)
     if usable is not None:
-        # Masked pixels must not take features from the others.
+        # Features of masked pixels would count toward the maximum.
         image = image.copy()
         image[~usable] = image[usable].mean(axis=0).round() if usable.any() else 0
     features = matcher.features(image)

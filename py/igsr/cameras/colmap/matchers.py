@@ -28,7 +28,7 @@ class Matchers:
     Attributes:
         name: for reports, and to recognize cameras found with them.
         sift: whether SIFT is one of them.
-        learned: makes the other one, or None.
+        learned: makes the learned matcher, or None.
         advice: how to place more photos, or "".
     """
 

@@ -92,8 +92,8 @@ def matched(count: int, features: Path, seed: int, show: Progress, *, verify: bo
 def with_focal_lengths(matches: Path, seed: int) -> Path:
     """Copy a database of matches and estimate focal lengths from all its pairs.
 
-    Where pairs show little but a plane, the estimate may be far off. Focal lengths that no usual
-    lens has stay as they were: the mapper starts from twice the right one without harm.
+    Pairs of a plane can give wrong estimates. Unusual focal lengths are not used: the mapper
+    recovers from an initial focal length of twice the true one.
     """
     pycolmap = load_pycolmap()
     database = matches.with_name(f"{CALIBRATED}{matches.name}")
@@ -136,7 +136,7 @@ def with_other_focal_lengths(database: Path, focals: Sequence[float]) -> Iterato
 
 
 def has_usual_focals(model: Any, database: Path) -> bool:
-    """Whether a model's focal lengths are usual ones, except those of EXIF.
+    """Whether all focal lengths of a model are usual or from EXIF.
 
     A few photos from far away look alike for all long focal lengths; the mapper may end at any.
     """
