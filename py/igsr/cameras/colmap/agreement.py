@@ -48,6 +48,13 @@ MIN_OWN_FRACTION = 0.5
 STRONG_FRACTION = 0.3
 
 
+def has_learned_features(database: Path) -> bool:
+    """Whether keypoints of a database have no descriptors: these are learned."""
+    pycolmap = load_pycolmap()
+    with pycolmap.Database.open(database) as opened:
+        return int(opened.num_keypoints()) > int(opened.num_descriptors())
+
+
 def agreeing(
     model: Any, matches: Mapping[Pair, npt.NDArray[np.uint32]], database: Path
 ) -> dict[Pair, int]:

@@ -21,6 +21,7 @@ from igsr.cameras.colmap.agreement import (
     GOOD_FRACTION,
     agreeing,
     consistent_part,
+    has_learned_features,
     missing_matches,
 )
 from igsr.cameras.colmap.contradictions import (
@@ -138,21 +139,24 @@ def mapped(
             # Mapped anew, because an extended model would keep its wrong cameras.
             best, most_agreeing = None, -1
             model = _mapped_once(count, matches, database, thresholds, seed, show)
+        better = False
         if model is not None:
             agreed = sum(agreeing(model, links(matches), matches).values())
-            if agreed > most_agreeing:
+            if better := agreed > most_agreeing:
                 best, best_attempt, most_agreeing = model, attempt, agreed
         missing = _missing(best, count)
         if best is not None and len(strengths) < all_links:
             hopeless = _unlinked(best, strengths, count)
         if best is not None and count > MAX_RETRY_PHOTOS:
             break
-        if missing <= hopeless and _agrees(best, matches):
+        settled = _agrees(best, matches) or (thresholds.guided_matching and not better)
+        if best is not None and missing <= hopeless and settled:
             break
         if attempt == 0:
             few_missing = len(missing) <= MAX_MISSING_FRACTION * count
     show("mapping", count, count)
-    if best is not None and count <= MAX_RETRY_PHOTOS:
+    # SIFT's matches are too few to judge parts by those between them.
+    if best is not None and count <= MAX_RETRY_PHOTOS and has_learned_features(matches):
         best = _without_disagreeing(best, matches)
     return Mapped(best, best_attempt >= FIRST_DOUBTFUL, all_links - len(strengths))
 
@@ -163,7 +167,7 @@ def _mapped_once(
     """The model with which most matches agree, until one of all photos does."""
     best: Any | None = None
     most = -1
-    for model in _models(count, database, thresholds, seed, show):
+    for model in _models(count, matches, database, thresholds, seed, show):
         if model is not None and has_usual_focals(model, database):
             agreed = sum(agreeing(model, links(matches), matches).values())
             if agreed > most:
@@ -174,12 +178,14 @@ def _mapped_once(
 
 
 def _models(
-    count: int, database: Path, thresholds: Thresholds, seed: int, show: Progress
+    count: int, matches: Path, database: Path, thresholds: Thresholds, seed: int, show: Progress
 ) -> Iterator[Any | None]:
     """Models of a database: of the incremental mapper, the global one, and other focal lengths."""
-    yield map_photos(count, database, thresholds, seed, show)
+    first = map_photos(count, database, thresholds, seed, show)
+    yield first
     if count <= MAX_TRIAL_PHOTOS:
-        if not thresholds.ignore_two_view_tracks:
+        # It places photos that only one pair connects at a wrong distance: nothing disagrees.
+        if first is not None and not _agrees(first, matches):
             yield map_globally(database, thresholds, seed)
         for start in with_other_focal_lengths(database, FOCALS):
             yield map_photos(count, start, thresholds, seed, show)
