@@ -40,7 +40,7 @@ NOT_RUN = {
     "docs/guides/blocks.md": 1,
     "README.md": 2,
     "docs/getting-started.md": 3,
-    "docs/guides/cameras.md": 1,
+    "docs/guides/cameras.md": 2,
     "docs/guides/denoising.md": 2,
     "docs/guides/installation.md": 2,
     "docs/guides/levels.md": 1,
