@@ -106,6 +106,7 @@ def with_all_evidence(
             seed,
             show,
             sift=matchers.sift,
+            aliked=matchers.aliked,
             usable=usable_by_image_id(photos),
             attempts=THRESHOLDS[:FIRST_DOUBTFUL],
         )

@@ -48,13 +48,6 @@ MIN_OWN_FRACTION = 0.5
 STRONG_FRACTION = 0.3
 
 
-def has_learned_features(database: Path) -> bool:
-    """Whether keypoints of a database have no descriptors: these are learned."""
-    pycolmap = load_pycolmap()
-    with pycolmap.Database.open(database) as opened:
-        return int(opened.num_keypoints()) > int(opened.num_descriptors())
-
-
 def agreeing(
     model: Any, matches: Mapping[Pair, npt.NDArray[np.uint32]], database: Path
 ) -> dict[Pair, int]:
@@ -165,8 +158,7 @@ def missing_matches(
     """Find pairs of a model's photos with too few learned matches for their cameras.
 
     Photos of one side of an object from nearly one direction share most of their learned features;
-    similar sides share few of them. So such a pair is at a wrong place. Photos by other matchers,
-    which find fewer matches, are not checked.
+    similar sides share few of them. So such a pair is at a wrong place.
 
     Args:
         model: pycolmap's reconstruction.

@@ -21,7 +21,6 @@ from igsr.cameras.colmap.agreement import (
     GOOD_FRACTION,
     agreeing,
     consistent_part,
-    has_learned_features,
     missing_matches,
 )
 from igsr.cameras.colmap.contradictions import (
@@ -85,6 +84,7 @@ def mapped(
     show: Progress,
     *,
     sift: bool = True,
+    aliked: bool = False,
     usable: Mapping[int, npt.NDArray[np.bool_]] | None = None,
     attempts: Sequence[Thresholds] = THRESHOLDS,
 ) -> Mapped:
@@ -96,6 +96,7 @@ def mapped(
         seed: random seed.
         show: called with "matching" or "mapping", done and total.
         sift: whether features are SIFT's, of which more matches can be searched.
+        aliked: whether features are ALIKED's, of which missing matches are evidence.
         usable: pixels [H, W] that can have features, by COLMAP's image id, for photos with a mask.
         attempts: the first ones of ``THRESHOLDS``.
     """
@@ -125,7 +126,7 @@ def mapped(
         else:
             model = _mapped_once(count, matches, database, thresholds, seed, show)
         for remapping in range(MAX_REMAPPINGS):
-            wrong = _wrong_links(model, matches, source, strengths, usable or {})
+            wrong = _wrong_links(model, matches, source, strengths, usable or {}, aliked)
             if not wrong:
                 break
             if attempt >= FIRST_DOUBTFUL or remapping + 1 == MAX_REMAPPINGS:
@@ -155,8 +156,7 @@ def mapped(
         if attempt == 0:
             few_missing = len(missing) <= MAX_MISSING_FRACTION * count
     show("mapping", count, count)
-    # SIFT's matches are too few to judge parts by those between them.
-    if best is not None and count <= MAX_RETRY_PHOTOS and has_learned_features(matches):
+    if best is not None and count <= MAX_RETRY_PHOTOS and aliked:
         best = _without_disagreeing(best, matches)
     return Mapped(best, best_attempt >= FIRST_DOUBTFUL, all_links - len(strengths))
 
@@ -218,6 +218,7 @@ def _wrong_links(
     source: Path,
     strengths: dict[Pair, int],
     usable: Mapping[int, npt.NDArray[np.bool_]],
+    aliked: bool,
 ) -> set[Pair]:
     """Pairs of photos whose matches make a model contradict its photos."""
     if model is None or model.num_reg_images() > MAX_RETRY_PHOTOS:
@@ -225,7 +226,7 @@ def _wrong_links(
     return links_between_parts(
         strengths,
         contradictions(model, links(source), usable),
-        missing_matches(model, links(matches), matches),
+        missing_matches(model, links(matches), matches) if aliked else (),
     )
 
 

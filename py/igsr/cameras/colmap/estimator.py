@@ -75,6 +75,7 @@ class Colmap:
                 seed,
                 show,
                 sift=self._matchers.sift,
+                aliked=self._matchers.aliked,
                 usable=usable_by_image_id(photos),
             )
             if result.model is not None:

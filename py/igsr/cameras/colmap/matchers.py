@@ -37,6 +37,11 @@ class Matchers:
     learned: Callable[[], Matcher] | None
     advice: str = ""
 
+    @property
+    def aliked(self) -> bool:
+        """Whether ALIKED is one of them."""
+        return self.learned is aliked.Aliked
+
 
 def chosen_matchers(choice: Choice) -> Matchers:
     """Return the matchers of a choice; nothing is loaded.
