@@ -95,8 +95,8 @@ def mapped(
         matches: COLMAP's database with features and matches; it may be changed.
         seed: random seed.
         show: called with "matching" or "mapping", done and total.
-        sift: whether features are SIFT's, of which more matches can be searched.
-        aliked: whether features are ALIKED's, of which missing matches are evidence.
+        sift: whether features are SIFT's; then guided matching is possible.
+        aliked: whether ALIKED is used; then missing matches can contradict a model.
         usable: pixels [H, W] that can have features, by COLMAP's image id, for photos with a mask.
         attempts: the first ones of ``THRESHOLDS``.
     """
