@@ -203,7 +203,7 @@ def test_too_few_features_are_an_error_or_replaced_by_rays():
 
 @pytest.mark.parametrize(("exact", "expected"), [(True, "sift"), (False, "rays")])
 def test_features_need_exact_poses(exact, expected):
-    capture = Capture(Path("wall"), [photo(angle) for angle in (-0.36, 0.36)])
+    capture = Capture(Path("wall"), [photo(angle) for angle in (-0.45, 0.45)])
     assert initial_splats(capture, 0, 200, 0, exact_poses=exact)[1] == expected
 
 

@@ -237,26 +237,27 @@ def reduction(steps: int, coarse_to_fine: bool, step: int, longest: int) -> int:
     ``longest`` is the longest side of all photos, in pixels.
     """
 
-def plane_sweep(
+def depth_maps(
     grays: list[Float32],
-    usable: list[npt.NDArray[np.uint8] | None],
+    usable: list[npt.NDArray[np.uint8]],
     viewmats: Float64,
     intrinsics: Float64,
-    sweeps: Sequence[tuple[int, Sequence[int], tuple[float, float], int]],
+    searches: Sequence[tuple[int, Sequence[int], tuple[float, float], Float32]],
 ) -> list[dict[str, Float32]]:
-    """Depth maps by plane sweep, scored by the correlation of 7 x 7 patches.
+    """Depth maps by PatchMatch stereo, of the pixels that other depth maps confirm.
 
     Args:
         grays: gray in 0..1 of V photos, [H, W] each.
-        usable: which of their pixels count, [H, W], not 0 where they do; or None for all.
+        usable: which of their pixels count, [H, W], not 0 where they do.
         viewmats: [V, 4, 4], world-to-camera.
         intrinsics: [V, 4], fx, fy, cx, cy in pixels.
-        sweeps: (index of the photo, indices of those compared with, inverse depths of the first
-            and the last plane, number of planes), one for each map.
+        searches: (index of the photo, indices of up to 8 compared with, inverse depths of the
+            nearest and the farthest surface, known points [P, 3] as column, row and inverse depth),
+            one for each map.
 
     Returns:
-        For each sweep "inverse_depth" [H, W] and "score" [H, W], the correlation in -1..1: the mean
-        of the two photos that agree best, -1 where none sees the place.
+        For each search "depth" [H, W], 0 where nothing confirms it; "normal" [H, W, 3] towards the
+        camera, in its frame; and "confidence" [H, W] in 0..1.
     """
 
 class Fitter:

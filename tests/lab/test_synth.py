@@ -14,7 +14,7 @@ from ray_stand_in import stand_in_ray
 from igsr import IgsrError
 from igsr.capture import load_capture
 from igsr_lab.synth import CaptureSettings, captures, mitsuba_scene, synthesize
-from igsr_lab.synth.cameras import Viewpoint, draw_rig, look_at
+from igsr_lab.synth.cameras import Viewpoint, at_angle, draw_rig, look_at
 from igsr_lab.synth.description import Description, Material, Part
 from igsr_lab.synth.materials import Materials
 from igsr_lab.synth.meshes import place, sheet, superquadric
@@ -65,6 +65,25 @@ def masks_and_depths(folder):
     for view in load_capture(folder).train_views:
         mask = np.asarray(Image.open(folder / "mask" / view.name))
         yield view, mask, np.load(folder / "depth" / Path(view.name).with_suffix(".npy"))
+
+
+@pytest.mark.parametrize("angle", [5.0, 30.0, 45.0])
+def test_cameras_at_an_angle_have_two_neighbors_there(angle, small_textures):
+    description = draw_description(np.random.default_rng(3))
+    rig = draw_rig(np.random.default_rng(0), description, 32)
+    plain, positions = at_angle(rig, 1.0, np.radians(angle), 5)
+    views = [plain.viewpoint(np.random.default_rng(1), position) for position in positions]
+    rays = np.stack([view.camera_to_world[:3, 3] - plain.center for view in views])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    apart = np.degrees(np.arccos(rays @ rays.T - 1e-12))
+    np.testing.assert_allclose([apart[k, k + 2] for k in range(3)], angle, rtol=1e-6)
+    np.testing.assert_allclose([apart[k, k + 1] for k in range(4)], angle, rtol=0.05)
+    assert rays[:, 2].min() > 0.0
+
+
+def test_the_angle_must_be_possible():
+    with pytest.raises(IgsrError, match="angle must be above 0"):
+        CaptureSettings(angle=61.0)
 
 
 def test_captures_load_with_the_written_cameras(made):
@@ -332,7 +351,8 @@ def test_the_command_reports_finished_scenes_and_overwrites_no_others(lone, lab_
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
     assert report["scenes"][0]["family"] == "object"
-    assert report["settings"] == {"size": 24, "views": 3, "test_views": 1, "spp": 4}
+    settings = {"size": 24, "views": 3, "test_views": 1, "spp": 4, "angle": None}
+    assert report["settings"] == settings
     assert "0 made, 1 already finished" in lab_here(*given, "24").stdout
     message = "was made with size 24, not 32; give another --out"
     assert message in lab_here(*given, "32").stderr

@@ -9,6 +9,7 @@ mod arrays;
 mod backend;
 mod benchmark;
 mod camera;
+mod depth_maps;
 mod error;
 mod example_files;
 mod exr_files;
@@ -17,7 +18,6 @@ mod fit_state;
 mod fitter;
 mod level_files;
 mod photos;
-mod plane_sweep;
 mod splat_arrays;
 mod splat_files;
 mod stages;
@@ -55,6 +55,8 @@ mod _core {
     #[pymodule_export]
     use crate::benchmark::{band_pixels, peak_multiply_add, time_pipeline, time_rasterize};
     #[pymodule_export]
+    use crate::depth_maps::depth_maps;
+    #[pymodule_export]
     use crate::example_files::example_files;
     #[pymodule_export]
     use crate::exr_files::{read_exr_depth, write_exr};
@@ -64,8 +66,6 @@ mod _core {
     use crate::fitter::{Fitter, splats_from_points};
     #[pymodule_export]
     use crate::level_files::{read_level, write_levels};
-    #[pymodule_export]
-    use crate::plane_sweep::plane_sweep;
     #[pymodule_export]
     use crate::splat_files::{morton_order, read_splats, write_splats};
     #[pymodule_export]

@@ -114,6 +114,7 @@ def initial_state(
         settings.start,
         dense=settings.density == "fixed",
         exact_poses=settings.poses == "fixed",
+        exact_focal=settings.focal == "fixed",
     )
     return splat_arrays(splats), (made_from, len(splats))
 

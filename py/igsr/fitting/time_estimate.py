@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from igsr import _core
-from igsr.fitting.initialization.plane_sweep import MAX_DEPTH_MAPS
+from igsr.fitting.initialization.depth_maps import MAX_DEPTH_MAPS
 from igsr.fitting.settings import FitSettings
 
 #: Sides of the two photos that steps are timed on, pixels, and the two numbers of splats.
@@ -29,7 +29,7 @@ MAX_SPLATS_PER_PIXEL = 0.5
 #: Number of parts that steps are summed over.
 PARTS = 50
 #: Seconds for the depth map of a photo, and for each pixel of a scored photo, at ``TYPICAL`` speed.
-DEPTH_MAP_SECONDS = 0.4
+DEPTH_MAP_SECONDS = 1.2
 SCORE_SECONDS_PER_PIXEL = 2e-6
 
 

@@ -249,6 +249,11 @@ def _poses_line(row: Row) -> str:
     )
 
 
+def _depths_line(row: Row) -> str:
+    right = "no depth" if row["right"] is None else f"{100 * row['right']:.1f} % right"
+    return f"{row['scene']}: {right} in {row['seconds']:.0f} s"
+
+
 def _own_photos_line(row: Row) -> str:
     seconds = sum(part["seconds"] for part in row["parts"].values())
     if "failed" in row:  # cameras
@@ -297,6 +302,13 @@ _add(
     "estimator",
     seeds=1,
     backend=False,
+)
+_add(
+    "depths",
+    "Compare depth maps by stereo with the true ones of synthetic captures.",
+    _depths_line,
+    backend=False,
+    ray=False,
 )
 _add(
     "own_photos",

@@ -21,6 +21,14 @@ def synth_command(
     views: Annotated[int, option("--views", help="Train photos per scene.")] = 24,
     test_views: Annotated[int, option("--test-views", help="Test photos per scene.")] = 8,
     spp: Annotated[int, option("--spp", help="Light paths per pixel, a square number.")] = 16,
+    angle: Annotated[
+        float | None,
+        option(
+            "--angle",
+            metavar="DEGREES",
+            help="Angle between neighboring train photos. Default: photos from all sides.",
+        ),
+    ] = None,
     jobs: Annotated[
         int | None, option("--jobs", help="Scenes made in parallel. Default: one per core.")
     ] = None,
@@ -51,7 +59,7 @@ def synth_command(
             scenes,
             seed=seed,
             first=first,
-            settings=synth.CaptureSettings(size, views, test_views, spp),
+            settings=synth.CaptureSettings(size, views, test_views, spp, angle),
             jobs=(os.cpu_count() or 1) if jobs is None else jobs,
             on_scene=on_scene,
             ray=ray,

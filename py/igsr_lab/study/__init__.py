@@ -13,11 +13,13 @@ from igsr_lab.study.refinement_studies import (
     table3,
 )
 from igsr_lab.study.study import Study
+from igsr_lab.study.true_depths import depths
 
 __all__ = [
     "Study",
     "blender8",
     "denoiser_table",
+    "depths",
     "few_photos",
     "own_photos",
     "photographs",

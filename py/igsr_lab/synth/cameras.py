@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -54,7 +54,7 @@ def look_at(center: np.ndarray, target: np.ndarray, roll: float = 0.0) -> np.nda
 class Rig:
     """The cameras of one scene."""
 
-    kind: str  # "hemisphere", "sphere", "turntable", "arc" or "forward"
+    kind: str  # "hemisphere", "sphere", "turntable", "arc", "forward" or "triangles"
     center: np.ndarray  # [3], the point that the cameras look at
     distance: float  # mean distance of the cameras from ``center``, world units
     azimuth: tuple[float, float]  # range, radians
@@ -145,3 +145,30 @@ def spread(rng: np.random.Generator, count: int, margin: float) -> np.ndarray:
     start = rng.random(2)
     positions = (start + np.arange(1, count + 1)[:, None] * _STEPS) % 1.0
     return np.asarray(margin + (1.0 - 2.0 * margin) * positions)
+
+
+def at_angle(rig: Rig, turn: float, angle: float, count: int) -> tuple[Rig, np.ndarray]:
+    """A rig with cameras in a strip of triangles with sides of ``angle``, seen from the center.
+
+    Args:
+        rig: its distance, unsteadiness and lens are kept.
+        turn: azimuth of the strip's middle, radians.
+        angle: between each camera and the next two, radians, up to 4 % less to the next.
+        count: number of cameras.
+
+    Returns:
+        The rig and the positions [count, 2] for ``Rig.viewpoint``.
+    """
+    height = 0.25 * math.sqrt(3.0) * angle
+    step = 0.5 * math.acos((math.cos(angle) - math.sin(height) ** 2) / math.cos(height) ** 2)
+    along = step * (np.arange(count) - 0.5 * (count - 1))
+    up = height * (-1.0) ** np.arange(count)
+    # All cameras are at least 6 degrees above the center.
+    tilt = max(math.asin(0.5 * sum(rig.elevation_sine)), height + math.radians(6.0))
+    ahead, aside = np.cos(up) * np.cos(along), np.cos(up) * np.sin(along)
+    azimuth = turn + np.arctan2(aside, math.cos(tilt) * ahead - math.sin(tilt) * np.sin(up))
+    rise = math.sin(tilt) * ahead + math.cos(tilt) * np.sin(up)
+    plain = replace(
+        rig, kind="triangles", azimuth=(0.0, 1.0), elevation_sine=(0.0, 1.0), follow=0.0
+    )
+    return plain, np.stack([azimuth, rise], axis=1)

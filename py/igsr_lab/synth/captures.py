@@ -40,7 +40,7 @@ from igsr_lab.synth.mitsuba_scene import (
     one_threaded_mitsuba,
     take_photo,
 )
-from igsr_lab.synth.photographs import choose_viewpoints, exposure
+from igsr_lab.synth.photographs import choose_viewpoints, exposure, viewpoints_at_angle
 from igsr_lab.synth.surroundings import draw_description
 
 #: Increased when a seed gives other scenes.
@@ -60,6 +60,8 @@ class CaptureSettings:
         views: number of train photos, at least 1.
         test_views: number of test photos.
         spp: light paths per pixel, a square number, 1 to 4096.
+        angle: between train photos next to each other, as the objects see them, degrees, up to 60;
+            None for photos from all sides.
 
     Raises:
         IgsrError: one is out of range.
@@ -69,6 +71,7 @@ class CaptureSettings:
     views: int = 24
     test_views: int = 8
     spp: int = 16
+    angle: float | None = None
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -78,6 +81,8 @@ class CaptureSettings:
         _check_range("spp", self.spp, 1, 4096)
         if math.isqrt(self.spp) ** 2 != self.spp:
             raise IgsrError(f"spp must be a square such as 9, 16 or 36, not {self.spp}.")
+        if self.angle is not None and not 0.0 < self.angle <= 60.0:
+            raise IgsrError(f"angle must be above 0 and up to 60 degrees, not {self.angle}.")
 
 
 def _check_range(name: str, value: int, low: int, high: int) -> None:
@@ -161,7 +166,10 @@ def scene_name(index: int) -> str:
 
 def _recipe(seed: int, index: int, settings: CaptureSettings) -> Row:
     """Everything that a scene depends on, except Mitsuba's version."""
-    return {"version": RECIPE_VERSION, "seed": seed, "index": index, **asdict(settings)}
+    recipe = {"version": RECIPE_VERSION, "seed": seed, "index": index, **asdict(settings)}
+    if settings.angle is None:
+        del recipe["angle"]  # scenes made before there were angles stay finished
+    return recipe
 
 
 def _finished(folder: Path, recipe: Row) -> Row | None:
@@ -246,6 +254,11 @@ def _photograph(folder: Path, seed: int, index: int, settings: CaptureSettings) 
         )
         for stream, split in enumerate(counts, start=2)
     }
+    if settings.angle is not None:
+        viewpoints["train"] = viewpoints_at_angle(
+            *(loaded, description, rig, np.random.default_rng([seed, index, 2])),
+            *(settings.views, math.radians(settings.angle)),
+        )
     gain = exposure(loaded, viewpoints["train"][:3], rng)
     taken = 0
     for split, cameras in viewpoints.items():

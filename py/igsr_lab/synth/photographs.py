@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from igsr_lab.synth.cameras import Rig, Viewpoint, spread
+from igsr_lab.synth.cameras import Rig, Viewpoint, at_angle, spread
 from igsr_lab.synth.description import Description
 from igsr_lab.synth.mitsuba_scene import LoadedScene, first_hits, take_photo
 
@@ -43,6 +43,27 @@ def choose_viewpoints(
         assert best is not None
         chosen.append(best)
     return chosen
+
+
+def viewpoints_at_angle(
+    loaded: LoadedScene,
+    description: Description,
+    rig: Rig,
+    rng: np.random.Generator,
+    count: int,
+    angle: float,
+) -> list[Viewpoint]:
+    """Cameras ``angle`` radians apart, from the side with the freest sight of the objects."""
+    best, least = [], np.inf
+    for _ in range(ATTEMPTS):
+        plain, positions = at_angle(rig, rng.uniform(*rig.azimuth), angle, count)
+        viewpoints = [plain.viewpoint(rng, position) for position in positions]
+        fault = sum(_fault(loaded, description, plain, viewpoint) for viewpoint in viewpoints)
+        if fault < least:
+            best, least = viewpoints, fault
+        if fault == 0.0:
+            break
+    return best
 
 
 def _probe(viewpoint: Viewpoint) -> Viewpoint:

@@ -4,17 +4,17 @@
 mod cameras;
 mod config;
 mod density;
+mod depth_maps;
 mod exposures;
 mod fitter;
 mod initial;
-mod plane_sweep;
 
 pub use cameras::{CameraConfig, CameraState, Cameras, Focal, PosePrior, scene_distance};
 pub use config::{Background, DensityControl, FitConfig};
+pub use depth_maps::{DepthMap, GrayPhoto, Search, depth_maps};
 pub use exposures::{ExposureState, Exposures};
 pub use fitter::{Fitter, scene_extent};
 pub use initial::splats_from_points;
-pub use plane_sweep::{DepthMap, GrayPhoto, Sweep, plane_sweep};
 
 pub use crate::constants::{ADAM, SSIM_C, SSIM_WINDOW};
 pub use crate::fit_device::{

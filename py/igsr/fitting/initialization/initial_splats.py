@@ -4,7 +4,7 @@ The points of each initialization are
 
 * "points": those of the capture (COLMAP);
 * "depths": those of the capture, and points of the photos' depth maps (``given_depths``) or, if
-  photos have none, of depth maps by plane sweep (``plane_sweep``);
+  photos have none, of depth maps by stereo (``depth_maps``) and, of few photos, "sift";
 * "hull": in the visual hull of photos with alpha (``visual_hull``);
 * "rays": on rays of photo pixels, at the depth where other photos agree best (``ray_depths``);
 * "sift": triangulated matches and points between them (``matched_points``);
@@ -23,18 +23,12 @@ import numpy as np
 import numpy.typing as npt
 
 from igsr import _core
-from igsr.cameras.colmap import aliked
 from igsr.capture import Capture, Points, View
 from igsr.errors import IgsrError
+from igsr.fitting.initialization.depth_maps import depth_points, have_neighbors, viewed_target
 from igsr.fitting.initialization.given_depths import given_points, have_depths
 from igsr.fitting.initialization.matched_points import matched_points, with_points_between
 from igsr.fitting.initialization.photo_pixels import at_most
-from igsr.fitting.initialization.plane_sweep import (
-    MAX_ANGLE_DEG,
-    can_sweep,
-    sweep_target,
-    swept_points,
-)
 from igsr.fitting.initialization.ray_depths import ray_points
 from igsr.fitting.initialization.visual_hull import hull_points, viewed_box
 from igsr.fitting.settings import Initialization
@@ -47,14 +41,15 @@ Generator = np.random.Generator
 DEFAULT_SPLATS = 20_000
 #: Number of points from depth maps, as a fraction of the maximum number of splats.
 DEPTHS_FRACTION = 0.5
-#: Minimum fraction of photos with another one from a similar direction for a plane sweep.
-MIN_SWEPT_FRACTION = 0.5
-#: With the trained matcher, photos must be within this angle for a plane sweep, degrees.
-MATCHED_ANGLE_DEG = 25.0
+#: Minimum fraction of photos with another one from a similar direction for depth maps.
+MIN_NEIGHBORS_FRACTION = 0.5
 #: Minimum number of points to start from.
 MIN_POINTS = 100
 #: Minimum number of triangulated features to start from.
 MIN_FEATURES = 30
+#: Triangulated features and points between them are added to depth maps of up to this many photos:
+#: depth maps of few photos have large gaps.
+MAX_JOINED_PHOTOS = 12
 #: Splats per triangulated feature; with many more, novel views get worse.
 SPLATS_PER_FEATURE = 10
 #: Number of splats of a random initialization (3DGS has 100 000, for many photos).
@@ -99,10 +94,8 @@ def chosen_start(capture: Capture, start: str = "auto", wanted: int = DEFAULT_SP
         return "points"
     if has_alpha:
         return "points" if points >= MIN_POINTS else "hull"
-    target = sweep_target(views, None if capture.points is None else capture.points.xyz)
-    # The trained matcher has right points where a sweep has many wrong ones.
-    angle = MATCHED_ANGLE_DEG if aliked.is_available() else MAX_ANGLE_DEG
-    if can_sweep(views, target, angle, MIN_SWEPT_FRACTION):
+    target = viewed_target(views, None if capture.points is None else capture.points.xyz)
+    if have_neighbors(views, target, fraction=MIN_NEIGHBORS_FRACTION):
         return "depths"
     return "points" if points >= MIN_POINTS else "sift"
 
@@ -116,6 +109,7 @@ def initial_splats(
     *,
     dense: bool = False,
     exact_poses: bool = True,
+    exact_focal: bool = True,
 ) -> tuple[Splats, str]:
     """Return the splats that a fit starts from, and the name of their initialization.
 
@@ -129,6 +123,8 @@ def initial_splats(
         start: an ``Initialization``.
         dense: make ``max_splats`` splats if the capture has no points.
         exact_poses: allow "auto" to choose "sift", which needs exact poses.
+        exact_focal: allow "auto" to choose "sift" and depth maps by stereo: splats that agree under
+            a wrong focal length keep a fit from finding the right one.
 
     Returns:
         Splats relative to the median of their points, and the initialization ("points" ...).
@@ -140,8 +136,12 @@ def initial_splats(
     if capture.points is not None:
         points = capture.points.seen_by(view.name for view in capture.train_views)
         capture = Capture(capture.path, capture.views, points)
-    if start == "auto" and not exact_poses and chosen_start(capture, start) == "sift":
-        start = "rays"
+    if start == "auto" and not (exact_poses and exact_focal):
+        chosen = chosen_start(capture, start)
+        by_stereo = chosen == "depths" and not have_depths(capture.train_views)
+        if chosen == "sift" or (by_stereo and not exact_focal):
+            points = 0 if capture.points is None else len(capture.points.xyz)
+            start = "points" if points >= MIN_POINTS else "rays"
     try:
         # Overflow is found by the check of the splats, with a better message.
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -219,8 +219,15 @@ def _with_depths(
             # Points of a capture are triangulated from several photos.
             confidence = np.concatenate([np.ones(len(known)), confidence])
     else:
-        count = wanted - len(known)
-        dense, colors = swept_points(views, known if len(known) else None, count, random)
+        seeds = known
+        if not len(known) and len(views) <= MAX_JOINED_PHOTOS:
+            features = matched_points(views)
+            if len(features[0]) >= MIN_FEATURES:
+                count = min(wanted // 2, DEFAULT_SPLATS, SPLATS_PER_FEATURE * len(features[0]))
+                seeds = features[0]
+                known, rgb = with_points_between(*features, count, random)
+        count = max(0, wanted - len(known))
+        dense, colors = depth_points(views, seeds if len(seeds) else None, count, random)
     return np.concatenate([known, dense]), np.concatenate([rgb, colors]), confidence
 
 

@@ -1,4 +1,4 @@
-"""Points by plane sweep are on the visible surface."""
+"""Depth maps by stereo, and their points, are on the visible surface."""
 
 from __future__ import annotations
 
@@ -8,19 +8,20 @@ import numpy as np
 import pytest
 import scenes
 
+from igsr import _core
 from igsr.capture import Camera, View
-from igsr.fitting.initialization.plane_sweep import (
+from igsr.fitting.initialization.depth_maps import (
     MAX_DEPTH,
     MAX_DEPTH_MAPS,
     MIN_DEPTH,
-    can_sweep,
     depth_maps,
-    swept_points,
+    depth_points,
+    have_neighbors,
 )
 
 SIZE, FOCAL, DEPTH = 64, 80.0, 4.0
-#: The wall moves by 8 pixels from photo to photo, and photos are compared at whole pixels.
-TOLERANCE = 0.3
+#: The wall moves by 8 pixels from photo to photo, and its texture is not interpolated.
+TOLERANCE = 0.15
 
 
 def wall(count=3, is_plain=lambda x: np.zeros(x.shape, dtype=bool), baseline=0.4, seed=0):
@@ -34,7 +35,7 @@ def wall(count=3, is_plain=lambda x: np.zeros(x.shape, dtype=bool), baseline=0.4
         K = np.array([[FOCAL, 0, SIZE / 2], [0, FOCAL, SIZE / 2], [0, 0, 1]])
         offset = (np.arange(SIZE) + 0.5 - SIZE / 2) / FOCAL * DEPTH
         y, x = np.meshgrid(offset, offset + center, indexing="ij")
-        colors = texture[((y + 2.0) * 10).astype(int) % 40, ((x + 10.0) * 10).astype(int) % 200]
+        colors = texture[((y + 2.0) * 7).astype(int) % 40, ((x + 10.0) * 7).astype(int) % 200]
         image = np.where(is_plain(x)[..., None], 128, colors).astype(np.uint8)
         views.append(View(f"{i}.png", Camera(viewmat, K, SIZE, SIZE), "train", image))
     return views
@@ -45,7 +46,7 @@ KNOWN = np.random.default_rng(0).uniform(-1.0, 1.0, (50, 3)) + np.array([0.0, 0.
 
 
 def points(views, count=400, seed=0):
-    return swept_points(views, KNOWN, count, np.random.default_rng(seed))
+    return depth_points(views, KNOWN, count, np.random.default_rng(seed))
 
 
 def fraction_on_wall(xyz):
@@ -85,14 +86,14 @@ def test_masked_pixels_have_no_points_and_do_not_matter():
     np.testing.assert_array_equal(xyz, masked(1))
 
 
-def test_photos_are_swept_if_another_is_near():
+def test_photos_have_neighbors_within_an_angle():
     angles = (0.0, 0.6, 1.2, 2.4)
     ring = [replace(wall(1)[0], camera=scenes.ring_camera(angle, SIZE)) for angle in angles]
     target = np.zeros(3)
-    assert can_sweep(ring[:3], target)
-    assert not can_sweep(ring, target)
-    assert not can_sweep(ring[:1], target)
-    assert not can_sweep(ring[:3], target, 30.0)
+    assert have_neighbors(ring[:3], target)
+    assert not have_neighbors(ring, target)
+    assert not have_neighbors(ring[:1], target)
+    assert not have_neighbors(ring[:3], target, 30.0)
 
 
 def back_to_back():
@@ -107,22 +108,40 @@ def test_photos_without_a_neighbor_give_no_points(views):
     assert xyz.shape == colors.shape == (0, 3)
 
 
-def test_known_points_narrow_the_range_of_depths():
+def test_depth_maps_have_depth_normals_and_confidence_where_confirmed():
+    for depth_map in depth_maps(wall(), KNOWN):
+        is_known = depth_map.depth > 0.0
+        assert is_known.mean() > 0.3
+        assert np.median(np.abs(depth_map.depth[is_known] / DEPTH - 1.0)) < 0.01
+        lengths = np.linalg.norm(depth_map.normal, axis=2)
+        np.testing.assert_allclose(lengths, is_known, atol=1e-5)
+        assert np.median(depth_map.normal[is_known], axis=0)[2] < -0.9
+        np.testing.assert_array_equal(depth_map.confidence > 0.0, is_known)
+        assert depth_map.confidence.max() <= 1.0
+
+
+def test_known_points_are_seeds_and_narrow_the_range_of_depths(monkeypatch):
     known = KNOWN - np.array([0.0, 0.0, DEPTH])
-    noise = np.random.default_rng(5).integers(0, 256, (SIZE, SIZE, 3)).astype(np.uint8)
     cameras = [scenes.ring_camera(angle, SIZE, DEPTH) for angle in (0.0, 0.2, 0.4)]
-    views = [replace(wall(1)[0], camera=camera, image=noise) for camera in cameras]
+    views = [replace(wall(1)[0], camera=camera) for camera in cameras]
+    given = []
+    monkeypatch.setattr(_core, "depth_maps", lambda *arguments: given.append(arguments[-1]) or [])
 
     def depth_range(known):
-        depth = 1.0 / depth_maps(views, known)[1].inverse_depth
-        return depth.min(), depth.max()
+        with pytest.raises(ValueError, match="zip"):  # no maps are returned
+            depth_maps(views, known)
+        _, others, (near, far), seeds = given[-1][0]
+        assert sorted(others) == [1, 2]
+        return 1.0 / near, 1.0 / far, seeds
 
-    nearest, farthest = depth_range(known)
+    nearest, farthest, seeds = depth_range(known)
     assert nearest < DEPTH - 1.0 < DEPTH + 1.0 < farthest
     assert farthest / nearest < 0.5 * MAX_DEPTH / MIN_DEPTH
+    assert seeds.shape == (len(known), 3)
+    np.testing.assert_allclose(1.0 / seeds[:, 2], known[:, 2] + DEPTH, rtol=1e-5)
     # Too few points do not count.
-    assert depth_range(known[:5]) == depth_range(None)
-    assert depth_range(None) == pytest.approx((MIN_DEPTH * DEPTH, MAX_DEPTH * DEPTH), rel=0.05)
+    assert depth_range(known[:5])[:2] == depth_range(None)[:2]
+    assert depth_range(None)[:2] == pytest.approx((MIN_DEPTH * DEPTH, MAX_DEPTH * DEPTH), rel=0.05)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -134,7 +153,7 @@ def test_points_need_a_second_depth_map_that_agrees(seed):
     assert len(points(views[:2], count=SIZE * SIZE)[0]) > 0.3 * SIZE * SIZE
 
 
-def test_of_many_photos_some_are_swept():
+def test_of_many_photos_some_have_depth_maps():
     views = wall(MAX_DEPTH_MAPS + 6, baseline=0.05)
     names = [depth_map.view.name for depth_map in depth_maps(views, KNOWN)]
     assert len(names) == MAX_DEPTH_MAPS
