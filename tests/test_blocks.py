@@ -26,7 +26,7 @@ from igsr_lab.large_scenes import towns
 SETTINGS = {"steps": 120, "max_splats": 1200}
 #: Also reduces photos of 48 pixels for the coarse fit, and finds a seam between two houses.
 SMALL = "from igsr.blocks import plan, tasks; "
-SMALL += "tasks.MIN_COARSE_SIDE_PX = 12; plan.MIN_SEAM_VISIBILITY = 0.05"
+SMALL += "tasks.MIN_COARSE_SIDE_PX = 12; plan.MIN_SEAM_VISIBILITY = 0.01"
 
 
 @pytest.fixture(autouse=True, scope="module")

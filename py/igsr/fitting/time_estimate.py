@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from igsr import _core
-from igsr.fitting.initialization.depth_maps import MAX_DEPTH_MAPS
+from igsr.fitting.initialization.depth_maps import MAX_DEPTH_MAPS, MAX_SIDE_PX
 from igsr.fitting.settings import FitSettings
 
 #: Sides of the two photos that steps are timed on, pixels, and the two numbers of splats.
@@ -28,9 +28,11 @@ GROWN_FRACTION = 0.95
 MAX_SPLATS_PER_PIXEL = 0.5
 #: Number of parts that steps are summed over.
 PARTS = 50
-#: Seconds for the depth map of a photo, and for each pixel of a scored photo, at ``TYPICAL`` speed.
-DEPTH_MAP_SECONDS = 1.2
+#: Seconds for each pixel of a depth map and of a scored photo, at ``TYPICAL`` speed.
+DEPTH_SECONDS_PER_PIXEL = 1.5e-5
 SCORE_SECONDS_PER_PIXEL = 2e-6
+#: Pixels of the depth map of a larger photo.
+MAX_DEPTH_MAP_PIXELS = 0.7 * MAX_SIDE_PX**2
 
 
 @dataclass(frozen=True)
@@ -145,8 +147,10 @@ def other_seconds(photos: int, scored: int, pixels: float, slowdown: float = 1.0
         pixels: of a photo.
         slowdown: of this machine.
     """
-    depth_maps = DEPTH_MAP_SECONDS * min(photos, MAX_DEPTH_MAPS)
-    return slowdown * (depth_maps + SCORE_SECONDS_PER_PIXEL * scored * pixels)
+    in_maps = min(photos, MAX_DEPTH_MAPS) * min(pixels, MAX_DEPTH_MAP_PIXELS)
+    return slowdown * (
+        DEPTH_SECONDS_PER_PIXEL * in_maps + SCORE_SECONDS_PER_PIXEL * scored * pixels
+    )
 
 
 def _timed_step(backend: str, side: int, splats: int, sh_degree: int, cover: float) -> float:
