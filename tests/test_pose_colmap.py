@@ -176,6 +176,12 @@ def test_photos_of_another_scene_are_named_and_the_others_placed(photos):
         capture = igsr.find_cameras([*photos[1:3], stranger, *photos[3:5]], "colmap")
     assert [view.name for view in capture.views] == ["1.png", "2.png", "3.png", "4.png"]
     assert capture.train_views == capture.views
+    garden = [
+        replace(photo, name=f"garden/{photo.name}") for photo in rooms.photos(CAMERAS[2:4], seed=7)
+    ]
+    two_places = Colmap("sift")([*photos[1:4], *garden])
+    assert [camera is not None for camera in two_places.cameras] == [True] * 3 + [False] * 2
+    assert "garden/0.png, garden/1.png match each other, but not" in two_places.warnings[1]
     with pytest.raises(igsr.IgsrError, match=r"No cameras found: the 2 photos \(1\.png"):
         igsr.find_cameras([photos[1], stranger], "colmap")
     away = [CAMERAS[2], rooms.camera(np.pi)]  # back to back

@@ -51,7 +51,10 @@ def pose_command(
     ] = None,
     frames: FramesOption = FRAMES,
     max_size: MaxSizeOption = None,
-    plot: Annotated[bool, option("--plot", help="Draw the cameras to --out/poses.png.")] = False,
+    plot: Annotated[
+        bool,
+        option("--plot", help="Draw the cameras to --out/poses.png, matches to --out/matches.png."),
+    ] = False,
     seed: SeedOption = 0,
     as_json: JsonOption = False,
 ) -> None:
@@ -80,7 +83,9 @@ def pose_command(
         f"{len(report['cameras'])} of {report['photos']} photos placed by {report['estimator']} "
         f"in {report['seconds']:.1f} s, {report['points']} points, seed {seed}"
     )
-    console.print("  ".join([str(out), *([str(out / "poses.png")] if plot else [])]), style="dim")
+    console.print(
+        "  ".join(map(str, [out, *sorted(out.glob("*.png"))] if plot else [out])), style="dim"
+    )
 
 
 def _posed(
@@ -96,6 +101,8 @@ def _posed(
     from igsr.cameras.plot_poses import plot_poses
     from igsr.capture.downscaling import check_max_size
     from igsr.capture.write_colmap import write_colmap
+    from igsr.evaluation.contact_sheet import panels_sheet, save_sheet
+    from igsr.evaluation.shared_points import SIDE_PX, pair_pictures, placed_by
 
     check_max_size(max_size)
     started = time.monotonic()
@@ -105,8 +112,13 @@ def _posed(
     path = photos if isinstance(photos, Path) else Path("photos")
     capture = found.capture(path, photos_at(photos, settings.frames, max_size, loaded))
     write_colmap(capture, out, depths=found.depths, further_masks={"trusted": found.trusted})
+    tracks = None if capture.points is None else capture.points.tracks
     if plot:
         plot_poses(out / "poses.png", capture)
+        pairs = [] if tracks is None else pair_pictures(tracks, capture.views)
+        if pairs:
+            rows = [[(picture, caption)] for caption, picture in pairs]
+            save_sheet(out / "matches.png", panels_sheet(rows, side=2 * SIDE_PX))
     return {
         "estimator": settings.estimator,
         "photos": len(found.names),
@@ -120,6 +132,7 @@ def _posed(
             for view in capture.views
         ],
         "not_placed": found.not_placed,
+        "placed_by": {} if tracks is None else placed_by(tracks),
         "points": 0 if capture.points is None else len(capture.points.xyz),
         "warnings": found.estimate.warnings,
         "weights": found.estimate.weights,

@@ -23,6 +23,7 @@ from igsr.evaluation.report_page import (
     write_template,
 )
 from igsr.evaluation.scores import ScoredView
+from igsr.evaluation.shared_points import SIDE_PX, pair_pictures
 from igsr.rendering.scene_page import PageModel
 from igsr.splats import Splats
 
@@ -65,6 +66,8 @@ def write_fit_page(
         "start": report["start"],
         "start_splats": report["start_splats"],
         "masked": _masked_photos(report["masked"], capture),
+        "pairs": _pairs(capture),
+        "placed_by": report["photos"]["placed_by"],
         "limit": report["limit"]["sentence"],
         "score_rows": _score_rows(report),
         "beside_text": "Held-out photos." if held_out else "Fitted photos; none is held out.",
@@ -100,6 +103,16 @@ def _masked_photos(masked: dict[str, float], capture: Capture) -> list[dict[str,
         caption = f"{name}, {100.0 * masked[name]:.1f} %"
         rows.append({"picture": jpeg(picture, BESIDE), "caption": caption})
     return rows
+
+
+def _pairs(capture: Capture) -> list[dict[str, str]]:
+    """Pictures of the points that pairs of photos share."""
+    if capture.points is None or capture.points.tracks is None:
+        return []
+    return [
+        {"picture": jpeg(picture, 2 * SIDE_PX), "caption": caption}
+        for caption, picture in pair_pictures(capture.points.tracks, capture.views)
+    ]
 
 
 def _score_rows(report: dict[str, Any]) -> list[dict[str, str]]:

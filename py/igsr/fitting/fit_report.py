@@ -16,6 +16,7 @@ from igsr.evaluation.contact_sheet import contact_sheet, save_sheet, sheet_names
 from igsr.evaluation.limits import limit_of
 from igsr.evaluation.quick_scores import train_photos, train_scores
 from igsr.evaluation.scores import METRICS, ScoredView, Scores, default_split, evaluate
+from igsr.evaluation.shared_points import placed_by
 from igsr.fitting.fit_page import write_fit_page
 from igsr.fitting.pose_refinement import refine_cameras
 from igsr.fitting.presets import chosen_keywords
@@ -138,13 +139,18 @@ def fit_report(
 
 
 def photo_counts(capture: Capture, not_placed: Sequence[str]) -> dict[str, Any]:
-    """Numbers of photos by their use, and the names of those without a camera."""
+    """Numbers of photos by their use, the names of those without a camera, and what placed others.
+
+    "placed_by" has the points of each photo if the capture has tracks; see ``placed_by``.
+    """
+    tracks = None if capture.points is None else capture.points.tracks
     return {
         "given": len(capture.views) + len(not_placed),
         "placed": len(capture.views),
         "train": len(capture.train_views),
         "test": len(capture.test_views),
         "not_placed": list(not_placed),
+        "placed_by": {} if tracks is None else placed_by(tracks),
     }
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from igsr.cameras.colmap.agreement import (
     GOOD_FRACTION,
+    MIN_SURE,
     agreeing,
     consistent_part,
     missing_matches,
@@ -70,11 +71,13 @@ class Mapped:
         model: pycolmap's reconstruction, or None if no two photos can be placed.
         doubtful: whether its thresholds were so low that it may be wrong.
         removed_pairs: number of pairs of photos whose matches were left out as contradictory.
+        other_scenes: indices of photos that match each other, but no photo of the model.
     """
 
     model: Any | None
     doubtful: bool
     removed_pairs: int
+    other_scenes: list[list[int]] = field(default_factory=list)
 
 
 def mapped(
@@ -158,7 +161,8 @@ def mapped(
     show("mapping", count, count)
     if best is not None and count <= MAX_RETRY_PHOTOS and aliked:
         best = _without_disagreeing(best, matches)
-    return Mapped(best, best_attempt >= FIRST_DOUBTFUL, all_links - len(strengths))
+    others = [] if best is None else _other_scenes(best, links(matches), count)
+    return Mapped(best, best_attempt >= FIRST_DOUBTFUL, all_links - len(strengths), others)
 
 
 def _mapped_once(
@@ -235,6 +239,20 @@ def _unlinked(model: Any, strengths: dict[Pair, int], count: int) -> set[int]:
     part = parts(strengths, ())
     of_model = {part.get(image) for image in model.reg_image_ids()}
     return {index for index in range(count) if part.get(image_id(index)) not in of_model}
+
+
+def _other_scenes(
+    model: Any, verified: Mapping[Pair, npt.NDArray[np.uint32]], count: int
+) -> list[list[int]]:
+    """Groups of two or more photos with many matches among them and few with a model's photos."""
+    part = parts({pair: len(m) for pair, m in verified.items() if len(m) >= MIN_SURE}, ())
+    of_model = {part.get(image) for image in model.reg_image_ids()}
+    groups: dict[int, list[int]] = {}
+    for index in range(count):
+        name = part.get(image_id(index))
+        if name is not None and name not in of_model:
+            groups.setdefault(name, []).append(index)
+    return sorted(groups.values())
 
 
 def _missing(model: Any | None, count: int) -> set[int]:

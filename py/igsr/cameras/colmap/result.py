@@ -46,6 +46,12 @@ def estimate_of(photos: Sequence[Photo], mapped: Mapped) -> Estimate:
             f"{len(photos) - len(missing)} of {len(photos)} photos are registered; {cause}: "
             f"{', '.join(missing)}."
         )
+    for group in mapped.other_scenes:
+        names = ", ".join(photos[index].name for index in group)
+        sentences.append(
+            f"{names} match each other, but not the registered photos: they may show another "
+            "place. Find their cameras in a run of their own."
+        )
     if mapped.removed_pairs:
         advice = " Add photos between these and the registered ones." if missing else ""
         sentences.append(

@@ -140,8 +140,8 @@ def initial_splats(
         chosen = chosen_start(capture, start)
         by_stereo = chosen == "depths" and not have_depths(capture.train_views)
         if chosen == "sift" or (by_stereo and not exact_focal):
-            points = 0 if capture.points is None else len(capture.points.xyz)
-            start = "points" if points >= MIN_POINTS else "rays"
+            known = 0 if capture.points is None else len(capture.points.xyz)
+            start = "points" if known >= MIN_POINTS else "rays"
     try:
         # Overflow is found by the check of the splats, with a better message.
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
