@@ -150,7 +150,8 @@ def test_two_rooms_that_look_alike_are_kept_apart(tmp_path, monkeypatch):
     estimate = estimate_of(photos, found)
     assert [camera is not None for camera in estimate.cameras] == [True] * 5 + [False] * 4
     assert pose_accuracy(estimate.cameras[:5], cameras)["rotation"] < 0.5
-    assert "look alike" in estimate.warnings[1]
+    assert "match each other, but not the registered photos" in estimate.warnings[1]
+    assert "look alike" in estimate.warnings[2]
 
 
 def test_photos_of_another_season_stay_in_one_model(tmp_path, monkeypatch):

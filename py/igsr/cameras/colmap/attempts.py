@@ -59,6 +59,9 @@ FOCALS = (1.2, 0.7, 2.0)
 MAX_TRIAL_PHOTOS = 12
 #: Maximum fraction of missing photos to extend a model instead of mapping again.
 MAX_MISSING_FRACTION = 0.25
+#: A model of fewer photos than this, and than half of all, is no result: look-alike things can give
+#: the few photos that only they connect any place, and nothing contradicts it.
+MIN_PLACED = 4
 #: Maximum number of times that matches are left out for one model.
 MAX_REMAPPINGS = 4
 
@@ -161,6 +164,8 @@ def mapped(
     show("mapping", count, count)
     if best is not None and count <= MAX_RETRY_PHOTOS and aliked:
         best = _without_disagreeing(best, matches)
+    if best is not None and best.num_reg_images() < min(MIN_PLACED, count / 2):
+        best = None
     others = [] if best is None else _other_scenes(best, links(matches), count)
     return Mapped(best, best_attempt >= FIRST_DOUBTFUL, all_links - len(strengths), others)
 
