@@ -168,12 +168,15 @@ def test_only_consistent_tracks_become_points(photos, monkeypatch):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_start_from_features(photos, found, seed):
+def test_a_start_from_features(seed):
+    """Photos too far apart for depth maps by stereo."""
+    photos = [photo(angle, size=200) for angle in (-0.45, 0.45)]
+    found = matched_points(photos)
     capture = Capture(Path("wall"), photos)
 
     def start(max_splats=10_000, seed=seed, **options):
-        splats, name = initial_splats(capture, seed, max_splats, 1, "sift", **options)
-        assert name == "sift"
+        splats, name = initial_splats(capture, seed, max_splats, 1, "depths", **options)
+        assert name == "depths"
         return splats
 
     splats = start()
@@ -187,21 +190,21 @@ def test_a_start_from_features(photos, found, seed):
     assert np.linalg.norm(between[:, None] - found[0], axis=-1).min(axis=1).max() < 0.5
     assert start() == splats
     assert start(seed=seed + 1) != splats
-    assert len(start(50)) == 50
+    assert len(start(400)) == 200
     assert len(start(9_000, dense=True)) == 9_000
 
 
 def test_too_few_features_are_an_error_or_replaced_by_rays():
     """Photos of a few blobs from all around have no features in common."""
     capture = scenes.capture(views=5, size=24)
-    assert chosen_start(capture) == "sift"
+    assert chosen_start(capture) == "depths"
     assert initial_splats(capture, 0, 200, 0)[1] == "rays"
-    message = r"^made-up: only \d+ points could be triangulated"
+    message = r"^made-up: depth maps and matches of its photos have only \d+ points"
     with pytest.raises(IgsrError, match=message):
-        initial_splats(capture, 0, 200, 0, "sift")
+        initial_splats(capture, 0, 200, 0, "depths")
 
 
-@pytest.mark.parametrize(("exact", "expected"), [(True, "sift"), (False, "rays")])
+@pytest.mark.parametrize(("exact", "expected"), [(True, "depths"), (False, "rays")])
 def test_features_need_exact_poses(exact, expected):
     capture = Capture(Path("wall"), [photo(angle) for angle in (-0.45, 0.45)])
     assert initial_splats(capture, 0, 200, 0, exact_poses=exact)[1] == expected

@@ -192,7 +192,7 @@ def count_outside_hull(splats, capture):
 
 def test_start_depends_on_the_photos(capture):
     assert chosen_start(capture) == "hull"
-    assert chosen_start(scenes.capture(views=4, size=24)) == "sift"
+    assert chosen_start(scenes.capture(views=4, size=24)) == "depths"
     assert chosen_start(scenes.capture(views=16, size=8)) == "depths"
     words = "^made-up has photos without alpha; start hull needs"
     assert_refused(words, initial_splats, scenes.capture(views=4, size=24), 0, 300, 1, "hull")

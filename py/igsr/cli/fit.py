@@ -46,7 +46,7 @@ from igsr.cli.output import (
     score_line,
 )
 
-Start = Literal["auto", "points", "depths", "hull", "sift", "rays", "random"]
+Start = Literal["auto", "points", "depths", "hull", "rays", "random"]
 
 StepsOption = Annotated[
     int | None, option("--steps", metavar="N", help="Optimizer steps.", panel=FIT)

@@ -103,8 +103,8 @@ def fit(
         depth_weight: initial weight of the relative error to the photos' depth maps
             (``View.depth``); decays to 1 %. 0 ignores them.
         start: the initialization: "auto", "points" (of the capture), "depths" (points of depth
-            maps), "hull" (visual hull of photos with alpha), "sift" (triangulated features),
-            "rays" or "random". Or splats of an earlier fit: the fit then takes the last ``steps``
+            maps and triangulated matches), "hull" (visual hull of photos with alpha), "rays" or
+            "random". Or splats of an earlier fit: the fit then takes the last ``steps``
             of the usual schedule.
         poses: "fixed" or "joint": optimize the cameras' poses with the splats. The mean pose stays.
         focal: "fixed", "shared" (one factor for all focal lengths) or "per-camera".

@@ -10,7 +10,7 @@ from igsr._internal.settings import about, validate
 from igsr.errors import IgsrError
 
 Density: TypeAlias = Literal["mcmc", "original", "fixed"]
-Initialization: TypeAlias = Literal["auto", "points", "depths", "hull", "sift", "rays", "random"]
+Initialization: TypeAlias = Literal["auto", "points", "depths", "hull", "rays", "random"]
 Poses: TypeAlias = Literal["fixed", "joint"]
 Focal: TypeAlias = Literal["fixed", "shared", "per-camera"]
 ExposureMode: TypeAlias = Literal["auto", "on", "off"]

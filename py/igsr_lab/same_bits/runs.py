@@ -120,7 +120,7 @@ def fits(inputs: Inputs) -> Results:
             **small | {"density": "original", "steps": 6100, "max_splats": 250, "sh_degree": 4},
         ),
     )
-    for start in ("points", "sift", "rays", "random"):
+    for start in ("points", "depths", "rays", "random"):
         options = small | {"steps": 120, "density": "original"}
         yield f"initialization {start}", fitted(room, **options, start=start)
     yield "initialization hull", fitted(around, **small | {"steps": 120}, start="hull")

@@ -4,15 +4,15 @@ The points of each initialization are
 
 * "points": those of the capture (COLMAP);
 * "depths": those of the capture, and points of the photos' depth maps (``given_depths``) or, if
-  photos have none, of depth maps by stereo (``depth_maps``) and, of few photos, "sift";
+  photos have none, triangulated matches and points between them (``matched_points``) and points of
+  depth maps by stereo (``depth_maps``);
 * "hull": in the visual hull of photos with alpha (``visual_hull``);
 * "rays": on rays of photo pixels, at the depth where other photos agree best (``ray_depths``);
-* "sift": triangulated matches and points between them (``matched_points``);
 * "random": in the box that the cameras look at.
 
 "auto" chooses the first that applies: depths if half of the photos have depth maps; points if there
 are enough; hull if photos have alpha and there are no points; depths if half of the photos have
-another one from a similar direction; points if there are any; sift; rays if features are too few.
+another one from a similar direction, or there are no points; rays if depths give too few.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ MIN_NEIGHBORS_FRACTION = 0.5
 MIN_POINTS = 100
 #: Minimum number of triangulated features to start from.
 MIN_FEATURES = 30
-#: Triangulated features and points between them are added to depth maps of up to this many photos:
-#: depth maps of few photos have large gaps.
+#: Photos in similar directions are matched, too, if there are at most this many: depth maps of few
+#: photos have large gaps.
 MAX_JOINED_PHOTOS = 12
 #: Splats per triangulated feature; with many more, novel views get worse.
 SPLATS_PER_FEATURE = 10
@@ -64,7 +64,7 @@ UNSURE_SIZE_FACTOR = 1.5
 def chosen_start(capture: Capture, start: str = "auto", wanted: int = DEFAULT_SPLATS) -> str:
     """Return the initialization that "auto" stands for, or ``start`` itself.
 
-    ``initial_splats`` may still replace "sift" and "depths" if they give too few points.
+    ``initial_splats`` may still replace "depths" if it gives too few points.
 
     Args:
         capture: its train views are used.
@@ -94,10 +94,7 @@ def chosen_start(capture: Capture, start: str = "auto", wanted: int = DEFAULT_SP
         return "points"
     if has_alpha:
         return "points" if points >= MIN_POINTS else "hull"
-    target = viewed_target(views, None if capture.points is None else capture.points.xyz)
-    if have_neighbors(views, target, fraction=MIN_NEIGHBORS_FRACTION):
-        return "depths"
-    return "points" if points >= MIN_POINTS else "sift"
+    return "points" if points >= MIN_POINTS and not _are_near(views, capture.points) else "depths"
 
 
 def initial_splats(
@@ -122,9 +119,9 @@ def initial_splats(
         sh_degree: 0 to 4; coefficients above degree 0 start at zero.
         start: an ``Initialization``.
         dense: make ``max_splats`` splats if the capture has no points.
-        exact_poses: allow "auto" to choose "sift", which needs exact poses.
-        exact_focal: allow "auto" to choose "sift" and depth maps by stereo: splats that agree under
-            a wrong focal length keep a fit from finding the right one.
+        exact_poses: allow "auto" to match photos from different directions.
+        exact_focal: allow "auto" to match photos: splats that agree under a wrong focal length keep
+            a fit from finding the right one.
 
     Returns:
         Splats relative to the median of their points, and the initialization ("points" ...).
@@ -137,9 +134,9 @@ def initial_splats(
         points = capture.points.seen_by(view.name for view in capture.train_views)
         capture = Capture(capture.path, capture.views, points)
     if start == "auto" and not (exact_poses and exact_focal):
-        chosen = chosen_start(capture, start)
-        by_stereo = chosen == "depths" and not have_depths(capture.train_views)
-        if chosen == "sift" or (by_stereo and not exact_focal):
+        views = capture.train_views
+        is_matched = chosen_start(capture, start) == "depths" and not have_depths(views)
+        if is_matched and not (exact_focal and _are_near(views, capture.points)):
             known = 0 if capture.points is None else len(capture.points.xyz)
             start = "points" if known >= MIN_POINTS else "rays"
     try:
@@ -163,23 +160,15 @@ def _initial_splats(
     random = np.random.default_rng([seed, 0x1617])
     points, views = capture.points, capture.train_views
     if start == "depths":
-        xyz, colors, confidence = _with_depths(views, points, wanted, random)
-        if len(xyz) >= MIN_POINTS:
+        xyz, colors, confidence = _with_depths(views, points, wanted, dense, random)
+        if len(xyz) >= min(MIN_POINTS, wanted):
             return _splats_at(xyz, colors, confidence, sh_degree), start
         if asked != "auto":
             raise IgsrError(
-                f"{capture.path}: the photos' depth maps agree in {len(xyz)} points only, too few "
-                "to start from; use start auto or random."
+                f"{capture.path}: depth maps and matches of its photos have only {len(xyz)} points "
+                "in common, too few to start from; use start rays or random."
             )
-        start = "points" if points is not None and len(points.xyz) >= MIN_POINTS else "sift"
-    features = matched_points(views) if start == "sift" else None
-    if features is not None and len(features[0]) < MIN_FEATURES:
-        if asked != "auto":
-            raise IgsrError(
-                f"{capture.path}: only {len(features[0])} points could be triangulated from "
-                "features of its photos, too few to start from; use start rays or random."
-            )
-        start = "rays"
+        start = "points" if points is not None and len(points.xyz) >= MIN_POINTS else "rays"
     confidence = None
     if start == "points" and points is not None:
         confidence = points.confidence
@@ -188,10 +177,6 @@ def _initial_splats(
             xyz, colors, confidence = at_most(max_splats, (*arrays, confidence), random)
         else:
             xyz, colors = at_most(max_splats, arrays, random)
-    elif start == "sift" and features is not None:
-        count = min(DEFAULT_SPLATS, SPLATS_PER_FEATURE * len(features[0]))
-        made = with_points_between(*features, max_splats if dense else count, random)
-        xyz, colors = at_most(max_splats, made, random)
     elif start == "random":
         low, high = viewed_box([view.camera for view in views])
         count = min(RANDOM_SPLATS, max_splats)
@@ -204,9 +189,9 @@ def _initial_splats(
 
 
 def _with_depths(
-    views: list[View], points: Points | None, wanted: int, random: Generator
+    views: list[View], points: Points | None, wanted: int, dense: bool, random: Generator
 ) -> tuple[Float64, Float64, Float64 | None]:
-    """``wanted`` points of the capture and of depth maps, their colors and confidence."""
+    """Up to ``wanted`` points of the capture and depth maps, their colors and confidence."""
     known, rgb = np.zeros((0, 3)), np.zeros((0, 3))
     if points is not None:
         # Given depth maps cover the whole scene: leave half of the splats for them.
@@ -214,21 +199,31 @@ def _with_depths(
         known, rgb = at_most(limit, (points.xyz, points.rgb / 255.0), random)
     confidence = None
     if have_depths(views):
-        dense, colors, confidence = given_points(views, wanted - len(known), random)
+        xyz, colors, confidence = given_points(views, wanted - len(known), random)
         if confidence is not None:
             # Points of a capture are triangulated from several photos.
             confidence = np.concatenate([np.ones(len(known)), confidence])
     else:
-        seeds = known
-        if not len(known) and len(views) <= MAX_JOINED_PHOTOS:
+        seeds, near = known, _are_near(views, points)
+        if not len(known) and (len(views) <= MAX_JOINED_PHOTOS or not near):
             features = matched_points(views)
             if len(features[0]) >= MIN_FEATURES:
-                count = min(wanted // 2, DEFAULT_SPLATS, SPLATS_PER_FEATURE * len(features[0]))
+                limit = wanted // 2 if near else wanted
+                if near or not dense:
+                    limit = min(limit, DEFAULT_SPLATS, SPLATS_PER_FEATURE * len(features[0]))
                 seeds = features[0]
-                known, rgb = with_points_between(*features, count, random)
-        count = max(0, wanted - len(known))
-        dense, colors = depth_points(views, seeds if len(seeds) else None, count, random)
-    return np.concatenate([known, dense]), np.concatenate([rgb, colors]), confidence
+                known, rgb = at_most(limit, with_points_between(*features, limit, random), random)
+        xyz, colors = np.zeros((0, 3)), np.zeros((0, 3))
+        if near:
+            count = max(0, wanted - len(known))
+            xyz, colors = depth_points(views, seeds if len(seeds) else None, count, random)
+    return np.concatenate([known, xyz]), np.concatenate([rgb, colors]), confidence
+
+
+def _are_near(views: list[View], points: Points | None) -> bool:
+    """Whether enough photos have another one from a similar direction for stereo."""
+    target = viewed_target(views, None if points is None else points.xyz)
+    return have_neighbors(views, target, fraction=MIN_NEIGHBORS_FRACTION)
 
 
 def _splats_at(xyz: Float64, colors: Float64, confidence: Float64 | None, sh_degree: int) -> Splats:
