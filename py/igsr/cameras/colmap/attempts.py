@@ -83,6 +83,19 @@ class Mapped:
     other_scenes: list[list[int]] = field(default_factory=list)
 
 
+@dataclass(frozen=True)
+class _Candidate:
+    """A model, and the number of verified matches that agree with it.
+
+    Attributes:
+        is_good: whether these are nearly all matches between its photos.
+    """
+
+    model: Any
+    agreed: int
+    is_good: bool
+
+
 def mapped(
     count: int,
     matches: Path,
@@ -110,12 +123,12 @@ def mapped(
     all_links = len(strengths)
     hopeless = set(range(count)) - {image - image_id(0) for pair in strengths for image in pair}
     source, database = matches, with_focal_lengths(matches, seed)
-    best: Any | None = None
-    best_attempt, most_agreeing = 0, -1
+    best: _Candidate | None = None
+    best_attempt = 0
     guided: set[int] = set()
     few_missing = False
     for attempt, thresholds in enumerate(attempts):
-        extending = few_missing and attempt != FIRST_DOUBTFUL and _agrees(best, matches)
+        extending = few_missing and attempt != FIRST_DOUBTFUL and best is not None and best.is_good
         if thresholds.guided_matching:
             wanted = _missing(best, count) if extending else set(range(count))
             if not wanted <= guided:
@@ -126,17 +139,19 @@ def mapped(
                 elif thresholds == replace(THRESHOLDS[attempt - 1], guided_matching=True):
                     continue  # nothing differs from the attempt before
 
-        if extending:
-            model = copy.deepcopy(best)
+        found: _Candidate | None
+        if extending and best is not None:
+            model = copy.deepcopy(best.model)
             extend(model, count, database, thresholds, seed, show)
+            found = _candidate(model, matches)
         else:
-            model = _mapped_once(count, matches, database, thresholds, seed, show)
+            found = _mapped_once(count, matches, database, thresholds, seed, show)
         for remapping in range(MAX_REMAPPINGS):
-            wrong = _wrong_links(model, matches, source, strengths, usable or {}, aliked)
+            wrong = _wrong_links(found, matches, source, strengths, usable or {}, aliked)
             if not wrong:
                 break
             if attempt >= FIRST_DOUBTFUL or remapping + 1 == MAX_REMAPPINGS:
-                model = None  # a doubtful model is no reason to leave out matches
+                found = None  # a doubtful model is no reason to leave out matches
                 break
             for pair in wrong:
                 del strengths[pair]
@@ -144,44 +159,42 @@ def mapped(
                 leave_out(file, wrong)
             database = with_focal_lengths(source, seed)
             # Mapped anew, because an extended model would keep its wrong cameras.
-            best, most_agreeing = None, -1
-            model = _mapped_once(count, matches, database, thresholds, seed, show)
-        better = False
-        if model is not None:
-            agreed = sum(agreeing(model, links(matches), matches).values())
-            if better := agreed > most_agreeing:
-                best, best_attempt, most_agreeing = model, attempt, agreed
+            best = None
+            found = _mapped_once(count, matches, database, thresholds, seed, show)
+        better = found is not None and (best is None or found.agreed > best.agreed)
+        if better:
+            best, best_attempt = found, attempt
         missing = _missing(best, count)
         if best is not None and len(strengths) < all_links:
-            hopeless = _unlinked(best, strengths, count)
+            hopeless = _unlinked(best.model, strengths, count)
         if best is not None and count > MAX_RETRY_PHOTOS:
             break
-        settled = _agrees(best, matches) or (thresholds.guided_matching and not better)
-        if best is not None and missing <= hopeless and settled:
+        settled = thresholds.guided_matching and not better
+        if best is not None and missing <= hopeless and (settled or best.is_good):
             break
         if attempt == 0:
             few_missing = len(missing) <= MAX_MISSING_FRACTION * count
     show("mapping", count, count)
-    if best is not None and count <= MAX_RETRY_PHOTOS and aliked:
-        best = _without_disagreeing(best, matches)
-    if best is not None and best.num_reg_images() < min(MIN_PLACED, count / 2):
-        best = None
-    others = [] if best is None else _other_scenes(best, links(matches), count)
-    return Mapped(best, best_attempt >= FIRST_DOUBTFUL, all_links - len(strengths), others)
+    model = None if best is None else best.model
+    if model is not None and count <= MAX_RETRY_PHOTOS and aliked:
+        model = _without_disagreeing(model, matches)
+    if model is not None and model.num_reg_images() < min(MIN_PLACED, count / 2):
+        model = None
+    others = [] if model is None else _other_scenes(model, links(matches), count)
+    return Mapped(model, best_attempt >= FIRST_DOUBTFUL, all_links - len(strengths), others)
 
 
 def _mapped_once(
     count: int, matches: Path, database: Path, thresholds: Thresholds, seed: int, show: Progress
-) -> Any | None:
-    """The model with which most matches agree, until one of all photos does."""
-    best: Any | None = None
-    most = -1
+) -> _Candidate | None:
+    """The model with which most matches agree, until nearly all agree with one of all photos."""
+    best: _Candidate | None = None
     for model in _models(count, matches, database, thresholds, seed, show):
         if model is not None and has_usual_focals(model, database):
-            agreed = sum(agreeing(model, links(matches), matches).values())
-            if agreed > most:
-                best, most = model, agreed
-            if not _missing(model, count) and _agrees(model, matches):
+            found = _candidate(model, matches)
+            if best is None or found.agreed > best.agreed:
+                best = found
+            if found.is_good and not _missing(found, count):
                 break
     return best
 
@@ -194,20 +207,18 @@ def _models(
     yield first
     if count <= MAX_TRIAL_PHOTOS:
         # It places photos that only one pair connects at a wrong distance: nothing disagrees.
-        if first is not None and not _agrees(first, matches):
+        if first is not None and not _candidate(first, matches).is_good:
             yield map_globally(database, thresholds, seed)
         for start in with_other_focal_lengths(database, FOCALS):
             yield map_photos(count, start, thresholds, seed, show)
 
 
-def _agrees(model: Any | None, matches: Path) -> bool:
-    """Whether nearly all matches between a model's photos agree with it."""
-    if model is None:
-        return False
+def _candidate(model: Any, matches: Path) -> _Candidate:
+    """A model with its agreement."""
     verified = links(matches)
     counts = agreeing(model, verified, matches)
-    total = sum(len(verified[pair]) for pair in counts)
-    return sum(counts.values()) >= GOOD_FRACTION * total
+    total, agreed = sum(len(verified[pair]) for pair in counts), sum(counts.values())
+    return _Candidate(model, agreed, agreed >= GOOD_FRACTION * total)
 
 
 def _without_disagreeing(model: Any, matches: Path) -> Any | None:
@@ -222,7 +233,7 @@ def _without_disagreeing(model: Any, matches: Path) -> Any | None:
 
 
 def _wrong_links(
-    model: Any | None,
+    found: _Candidate | None,
     matches: Path,
     source: Path,
     strengths: dict[Pair, int],
@@ -230,8 +241,9 @@ def _wrong_links(
     aliked: bool,
 ) -> set[Pair]:
     """Pairs of photos whose matches make a model contradict its photos."""
-    if model is None or model.num_reg_images() > MAX_RETRY_PHOTOS:
+    if found is None or found.model.num_reg_images() > MAX_RETRY_PHOTOS:
         return set()
+    model = found.model
     return links_between_parts(
         strengths,
         contradictions(model, links(source), usable),
@@ -260,7 +272,7 @@ def _other_scenes(
     return sorted(groups.values())
 
 
-def _missing(model: Any | None, count: int) -> set[int]:
+def _missing(found: _Candidate | None, count: int) -> set[int]:
     """Indices of photos that are not in a model."""
-    placed = set() if model is None else set(model.reg_image_ids())
+    placed = set() if found is None else set(found.model.reg_image_ids())
     return {index for index in range(count) if image_id(index) not in placed}
