@@ -118,3 +118,13 @@ def test_photos_that_are_too_far_apart_name_the_extra(monkeypatch):
     monkeypatch.setattr(aliked, "is_available", lambda: True)
     with pytest.raises(IgsrError, match=r"overlap more$"):
         igsr.find_cameras(away, "colmap")
+
+
+@pytest.mark.long
+def test_the_photos_of_the_example_are_placed(example_path, with_aliked):
+    views = igsr.load_capture(example_path).train_views
+    photos = [Photo(view.name, view.image) for view in views]
+    found = Colmap()(photos)
+    accuracy = pose_accuracy(found.cameras, [view.camera for view in views])
+    assert accuracy["registered"] >= 0.9 * len(photos)
+    assert accuracy["rotation"] < 3.0

@@ -272,7 +272,20 @@ def test_held_out_photos_do_not_contribute_points():
     assert np.array_equal(seen.xyz, xyz[counts >= 2])
     assert np.array_equal(seen.confidence, points.confidence[counts >= 2])
     split = [replace(view, split="train" if view is not views[5] else "test") for view in views]
-    splats, start = initial_splats(igsr.Capture(Path("a"), split, points), 0, 10_000, 0)
+    capture = igsr.Capture(Path("a"), split, points)
+    splats, start = initial_splats(capture, 0, 10_000, 0, "points")
     assert (start, len(splats)) == ("points", (counts >= 2).sum())
     empty = Points(xyz, points.rgb, tracks=Tracks([], *(tracks.view[:0],) * 2, tracks.xy[:0]))
     assert empty.seen_by([]) is empty
+
+
+def test_few_photos_start_with_points_between_those_of_the_capture(capture):
+    xyz = np.random.default_rng(0).normal(size=(150, 3))
+    points = Points(xyz, np.full((150, 3), 128, np.uint8), np.linspace(1.0, 2.0, 150))
+    few = igsr.Capture(capture.path, capture.train_views[:8], points)
+    splats, name = initial_splats(few, 0, 10_000, 0)
+    assert (name, len(splats)) == ("points", 1500)
+    np.testing.assert_allclose(splats.means[:150] + splats.origin, xyz, atol=1e-5)
+    assert len(np.unique(splats.opacities)) > 1000  # confidence is interpolated, too
+    assert len(initial_splats(few, 0, 400, 0)[0]) == 400
+    assert len(initial_splats(few, 0, 10_000, 0, "points")[0]) == 150

@@ -32,6 +32,7 @@ from igsr.cameras.colmap.contradictions import (
     links_between_parts,
     parts,
 )
+from igsr.cameras.colmap.cycles import consistent_databases
 from igsr.cameras.colmap.database import image_id
 from igsr.cameras.colmap.mapping import Thresholds, extend, map_globally, map_photos
 from igsr.cameras.colmap.matching import (
@@ -145,7 +146,7 @@ def mapped(
             extend(model, count, database, thresholds, seed, show)
             found = _candidate(model, matches)
         else:
-            found = _mapped_once(count, matches, database, thresholds, seed, show)
+            found = _mapped_once(count, matches, database, thresholds, seed, show, aliked)
         for remapping in range(MAX_REMAPPINGS):
             wrong = _wrong_links(found, matches, source, strengths, usable or {}, aliked)
             if not wrong:
@@ -160,7 +161,7 @@ def mapped(
             database = with_focal_lengths(source, seed)
             # Mapped anew, because an extended model would keep its wrong cameras.
             best = None
-            found = _mapped_once(count, matches, database, thresholds, seed, show)
+            found = _mapped_once(count, matches, database, thresholds, seed, show, aliked)
         better = found is not None and (best is None or found.agreed > best.agreed)
         if better:
             best, best_attempt = found, attempt
@@ -185,11 +186,17 @@ def mapped(
 
 
 def _mapped_once(
-    count: int, matches: Path, database: Path, thresholds: Thresholds, seed: int, show: Progress
+    count: int,
+    matches: Path,
+    database: Path,
+    thresholds: Thresholds,
+    seed: int,
+    show: Progress,
+    aliked: bool,
 ) -> _Candidate | None:
     """The model with which most matches agree, until nearly all agree with one of all photos."""
     best: _Candidate | None = None
-    for model in _models(count, matches, database, thresholds, seed, show):
+    for model in _models(count, matches, database, thresholds, seed, show, aliked):
         if model is not None and has_usual_focals(model, database):
             found = _candidate(model, matches)
             if best is None or found.agreed > best.agreed:
@@ -200,17 +207,48 @@ def _mapped_once(
 
 
 def _models(
-    count: int, matches: Path, database: Path, thresholds: Thresholds, seed: int, show: Progress
+    count: int,
+    matches: Path,
+    database: Path,
+    thresholds: Thresholds,
+    seed: int,
+    show: Progress,
+    aliked: bool,
 ) -> Iterator[Any | None]:
-    """Models of a database: of the incremental mapper, the global one, and other focal lengths."""
+    """Models of the incremental mapper, the global one, and those with other focal lengths."""
     first = map_photos(count, database, thresholds, seed, show)
     yield first
     if count <= MAX_TRIAL_PHOTOS:
         # It places photos that only one pair connects at a wrong distance: nothing disagrees.
         if first is not None and not _candidate(first, matches).is_good:
             yield map_globally(database, thresholds, seed)
+        is_new = thresholds in (THRESHOLDS[0], THRESHOLDS[FIRST_DOUBTFUL - 1])
+        for start in consistent_databases(database) if is_new else ():
+            yield from (
+                model
+                for model in (
+                    map_globally(start, thresholds, seed),
+                    map_photos(count, start, thresholds, seed, show),
+                )
+                if _is_confirmed(model, start, matches, aliked)
+            )
         for start in with_other_focal_lengths(database, FOCALS):
             yield map_photos(count, start, thresholds, seed, show)
+
+
+def _is_confirmed(model: Any | None, start: Path, matches: Path, aliked: bool) -> bool:
+    """Whether a model of matches that were chosen by cycles has all photos and agrees with them.
+
+    Look-alike things make cycles, too, but seldom a whole model.
+    """
+    if model is None:
+        return False
+    photos = {photo for pair in links(start) for photo in pair}
+    return (
+        photos <= set(model.reg_image_ids())
+        and _candidate(model, start).is_good
+        and not (aliked and missing_matches(model, links(matches), matches))
+    )
 
 
 def _candidate(model: Any, matches: Path) -> _Candidate:

@@ -119,7 +119,7 @@ def with_other_focal_lengths(database: Path, focals: Sequence[float]) -> Iterato
         focals: in units of the longer side; a copy is made for each if it changes a camera.
     """
     pycolmap = load_pycolmap()
-    known = _known_focals(database)
+    known = known_focals(database)
     for focal in focals:
         copied = database.with_name(f"focal_{focal}_{database.name}")
         shutil.copyfile(database, copied)
@@ -140,7 +140,7 @@ def has_usual_focals(model: Any, database: Path) -> bool:
 
     A few photos from far away look alike for all long focal lengths; the mapper may end at any.
     """
-    known = _known_focals(database)
+    known = known_focals(database)
     return all(
         camera.camera_id in known
         or MIN_FOCAL <= camera.mean_focal_length() / max(camera.width, camera.height) <= MAX_FOCAL
@@ -148,7 +148,7 @@ def has_usual_focals(model: Any, database: Path) -> bool:
     )
 
 
-def _known_focals(database: Path) -> set[int]:
+def known_focals(database: Path) -> set[int]:
     """Ids of cameras whose focal length was known before ``with_focal_lengths``."""
     pycolmap = load_pycolmap()
     source = database.with_name(database.name.partition(CALIBRATED)[2])

@@ -2,7 +2,7 @@
 
 The points of each initialization are
 
-* "points": those of the capture (COLMAP);
+* "points": those of the capture (COLMAP) and, of few photos with "auto", points between them;
 * "depths": those of the capture, and points of the photos' depth maps (``given_depths``) or, if
   photos have none, triangulated matches and points between them (``matched_points``) and points of
   depth maps by stereo (``depth_maps``);
@@ -47,8 +47,8 @@ MIN_NEIGHBORS_FRACTION = 0.5
 MIN_POINTS = 100
 #: Minimum number of triangulated features to start from.
 MIN_FEATURES = 30
-#: Photos in similar directions are matched, too, if there are at most this many: depth maps of few
-#: photos have large gaps.
+#: Photos in similar directions are matched, too, if there are at most this many, and points between
+#: those of the capture are added: the points and depth maps of few photos have large gaps.
 MAX_JOINED_PHOTOS = 12
 #: Splats per triangulated feature; with many more, novel views get worse.
 SPLATS_PER_FEATURE = 10
@@ -171,12 +171,15 @@ def _initial_splats(
         start = "points" if points is not None and len(points.xyz) >= MIN_POINTS else "rays"
     confidence = None
     if start == "points" and points is not None:
-        confidence = points.confidence
-        arrays = (points.xyz, points.rgb.astype(np.float64) / 255.0)
-        if confidence is not None:
-            xyz, colors, confidence = at_most(max_splats, (*arrays, confidence), random)
-        else:
-            xyz, colors = at_most(max_splats, arrays, random)
+        xyz, values = points.xyz, points.rgb.astype(np.float64) / 255.0
+        if points.confidence is not None:
+            values = np.column_stack([values, points.confidence])
+        if asked == "auto" and len(views) <= MAX_JOINED_PHOTOS:
+            count = min(max_splats, DEFAULT_SPLATS, SPLATS_PER_FEATURE * len(xyz))
+            xyz, values = with_points_between(xyz, values, count, random)
+        xyz, values = at_most(max_splats, (xyz, values), random)
+        colors = np.ascontiguousarray(values[:, :3])
+        confidence = None if points.confidence is None else values[:, 3]
     elif start == "random":
         low, high = viewed_box([view.camera for view in views])
         count = min(RANDOM_SPLATS, max_splats)
