@@ -7,6 +7,9 @@ Transformation" (TIM 2023); Lindenberger et al., "LightGlue: Local Feature Match
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import PackageNotFoundError, distribution, version
 from pathlib import Path
 from typing import Any
@@ -77,6 +80,22 @@ class Aliked:
         )
         self._extractor = extractor.eval().to(self._device)
         self._matcher = LightGlue(features="aliked").eval().to(self._device)
+
+    @contextlib.contextmanager
+    def pool(self) -> Iterator[ThreadPoolExecutor]:
+        """Return threads for ``features`` and ``matches``.
+
+        On a CPU each has one thread of torch: faster than more threads for one pair of photos, and
+        results do not depend on their number.
+        """
+        before = self._torch.get_num_threads()
+        count = 1 if self._device.type == "cuda" else before
+        threads = ThreadPoolExecutor(count, initializer=lambda: self._torch.set_num_threads(1))
+        try:
+            yield threads
+        finally:
+            threads.shutdown(cancel_futures=True)
+            self._torch.set_num_threads(before)
 
     def features(self, image: npt.NDArray[np.uint8]) -> PhotoFeatures:
         """Return features of a photo, RGB [H, W, 3], the best first."""

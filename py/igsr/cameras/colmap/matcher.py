@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -78,10 +79,11 @@ def add_matches(
     """
     pycolmap = load_pycolmap()
     count = len(photos)
-    features = []
-    for index, photo in enumerate(photos):
-        show("learned features", index, count)
-        features.append(usable_features(matcher, photo))
+    features: list[PhotoFeatures] = []
+    with _mapping(matcher) as in_order:
+        for one in in_order(lambda photo: usable_features(matcher, photo), photos):
+            show("learned features", len(features), count)
+            features.append(one)
     show("learned features", count, count)
     pairs = [
         (a, b)
@@ -89,11 +91,11 @@ def add_matches(
         # The views of a panorama have one center.
         if (place := photos[a].place) is None or place.rig != getattr(photos[b].place, "rig", None)
     ]
-    with pycolmap.Database.open(database) as opened:
+    with pycolmap.Database.open(database) as opened, _mapping(matcher) as in_order:
         first = [_add_keypoints(opened, i, one.xy) for i, one in enumerate(features)]
-        for done, (a, b) in enumerate(pairs):
+        found = in_order(lambda p: checked_matches(matcher, features[p[0]], features[p[1]]), pairs)
+        for done, ((a, b), matches) in enumerate(zip(pairs, found, strict=True)):
             show("learned matches", done, len(pairs))
-            matches = checked_matches(matcher, features[a], features[b])
             if len(matches):
                 ids = image_id(a), image_id(b)
                 matches += np.array([first[a], first[b]], dtype=np.uint32)
@@ -113,6 +115,17 @@ def add_matches(
         verification = pycolmap.TwoViewGeometryOptions()
         verification.ransac.random_seed = seed
         pycolmap.verify_matches(database, listing, verification)
+
+
+@contextlib.contextmanager
+def _mapping(matcher: Matcher) -> Iterator[Callable[..., Iterable[Any]]]:
+    """``map``, in the threads of a matcher's ``pool`` if it has one."""
+    pool = getattr(matcher, "pool", None)
+    if pool is None:
+        yield map
+    else:
+        with pool() as threads:
+            yield threads.map
 
 
 def _add_keypoints(opened: Any, index: int, xy: npt.NDArray[np.float32]) -> int:
