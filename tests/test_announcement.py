@@ -8,6 +8,7 @@ import pytest
 import scenes
 from PIL import Image
 
+from igsr.cameras.colmap import aliked
 from igsr.cameras.colmap.estimator import camera_seconds
 from igsr.capture.load import Overview, look_at
 from igsr.fitting import announcement, settings_for, time_estimate
@@ -66,6 +67,14 @@ def test_cameras_take_longer_for_more_and_larger_photos():
     small = camera_seconds([(400, 300)] * 10)
     assert 0.0 < small < camera_seconds([(1600, 1200)] * 10) < camera_seconds([(1600, 1200)] * 40)
     assert camera_seconds([(4000, 3000)] * 10) == camera_seconds([(1600, 1200)] * 10)
+
+
+def test_the_trained_matcher_takes_longer(with_aliked):
+    sizes = [(1600, 1200)] * 10
+    learned = camera_seconds(sizes)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(aliked, "is_available", lambda: False)
+        assert camera_seconds(sizes) < 0.5 * learned
 
 
 def overview(sizes, **fields):
@@ -138,6 +147,6 @@ def test_photos_without_depth_maps_take_less(announced):
     assert "about 2 min" in time(seen)
     # A slow GPU does not say how fast the CPU is, which computes depth maps and scores.
     assert "about 15 s" in announced(seen, given={"steps": 10}, backend="gpu")[2]
-    for changed in (replace(seen, channels=4), replace(seen, depths=True)):
-        assert "about 10 s" in time(changed)
-    assert "about 10 s" in time(seen, start="points")
+    assert "about 10 s" in time(replace(seen, channels=4))
+    assert "about 5 s" in time(replace(seen, depths=True))
+    assert "about 5 s" in time(seen, start="points")

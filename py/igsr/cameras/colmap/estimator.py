@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from igsr._internal.load_pycolmap import load_pycolmap
 from igsr._internal.user_warning import warn_user
+from igsr.cameras.colmap import aliked
 from igsr.cameras.colmap.attempts import mapped
 from igsr.cameras.colmap.database import image_id, list_photos
 from igsr.cameras.colmap.features import MAX_SIDE_PX, find_features, usable_pixels
@@ -21,7 +22,12 @@ from igsr.cameras.colmap.mapping import without_distortion
 from igsr.cameras.colmap.matcher import add_matches
 from igsr.cameras.colmap.matchers import AUTO, Choice, Matchers, chosen_matchers
 from igsr.cameras.colmap.matching import matched
-from igsr.cameras.colmap.pairs import FOLLOWING_PHOTOS, MAX_EXHAUSTIVE_PHOTOS, SIMILAR_PHOTOS
+from igsr.cameras.colmap.pairs import (
+    FOLLOWING_PHOTOS,
+    MAX_EXHAUSTIVE_PHOTOS,
+    SIMILAR_LEARNED,
+    SIMILAR_PHOTOS,
+)
 from igsr.cameras.colmap.result import estimate_of
 from igsr.cameras.estimate import Estimate, Progress
 from igsr.capture.photo_folder import Photo
@@ -34,6 +40,9 @@ MANY_PHOTOS = 200
 FEATURES_SECONDS = 0.9
 PAIR_SECONDS = 0.15
 PLACE_SECONDS = 0.3
+#: Of one core, for the trained matcher's features of a photo and for a pair.
+LEARNED_FEATURES_SECONDS = 1.7
+LEARNED_PAIR_SECONDS = 2.0
 
 
 class Colmap:
@@ -87,7 +96,7 @@ class Colmap:
 
 
 def camera_seconds(sizes: Sequence[tuple[int, int]]) -> float:
-    """Estimate the seconds that COLMAP takes on this machine.
+    """Estimate the seconds that COLMAP takes on this machine, with matcher "auto".
 
     Args:
         sizes: width and height of each photo, pixels.
@@ -101,6 +110,9 @@ def camera_seconds(sizes: Sequence[tuple[int, int]]) -> float:
     if count <= MAX_EXHAUSTIVE_PHOTOS:
         pairs = count * (count - 1) // 2
     parallel = FEATURES_SECONDS * pixels / 1e6 + PAIR_SECONDS * pairs
+    if aliked.is_available():
+        learned = min(count * (count - 1) // 2, count * SIMILAR_LEARNED)
+        parallel += LEARNED_FEATURES_SECONDS * count + LEARNED_PAIR_SECONDS * learned
     return parallel / max(1, cores or 1) + PLACE_SECONDS * count
 
 
