@@ -1,4 +1,4 @@
-"""The points that photos share: what placed each photo, and pictures of pairs to check by eye."""
+"""Points that photos share: counts and pictures, to check found cameras by eye."""
 
 from __future__ import annotations
 
@@ -59,12 +59,12 @@ def pair_pictures(
 ) -> list[tuple[str, npt.NDArray[np.uint8]]]:
     """Draw pairs of photos side by side, with lines between the points that both show.
 
-    Each photo is paired with the one it shares most points with; the pairs with the fewest points,
-    which are the most doubtful, come first.
+    Each photo is paired with the photo that shares the largest number of points with it. Pairs with
+    the fewest points come first, since they are the most doubtful.
 
     Args:
         tracks: in pixels of the views.
-        photos: of which pairs are drawn.
+        photos: the photos to draw.
 
     Returns:
         At most ``MAX_PAIRS`` captions and pictures, uint8 [H, W, 3].

@@ -60,8 +60,8 @@ FOCALS = (1.2, 0.7, 2.0)
 MAX_TRIAL_PHOTOS = 12
 #: Maximum fraction of missing photos to extend a model instead of mapping again.
 MAX_MISSING_FRACTION = 0.25
-#: A model of fewer photos than this, and than half of all, is no result: look-alike things can give
-#: the few photos that only they connect any place, and nothing contradicts it.
+#: A model of fewer photos than this, and than half of all photos, is rejected: photos that only
+#: look-alike things connect can have any position, and nothing contradicts it.
 MIN_PLACED = 4
 #: Maximum number of times that matches are left out for one model.
 MAX_REMAPPINGS = 4
@@ -152,14 +152,14 @@ def mapped(
             if not wrong:
                 break
             if attempt >= FIRST_DOUBTFUL or remapping + 1 == MAX_REMAPPINGS:
-                found = None  # a doubtful model is no reason to leave out matches
+                found = None  # matches are not left out because of a doubtful model
                 break
             for pair in wrong:
                 del strengths[pair]
             for file in {matches, source}:
                 leave_out(file, wrong)
             database = with_focal_lengths(source, seed)
-            # Mapped anew, because an extended model would keep its wrong cameras.
+            # Mapped again, because an extended model would keep its wrong cameras.
             best = None
             found = _mapped_once(count, matches, database, thresholds, seed, show, aliked)
         better = found is not None and (best is None or found.agreed > best.agreed)
@@ -215,7 +215,7 @@ def _models(
     show: Progress,
     aliked: bool,
 ) -> Iterator[Any | None]:
-    """Models of the incremental mapper, the global one, and those with other focal lengths."""
+    """Models of the incremental and the global mapper, also with other focal lengths."""
     first = map_photos(count, database, thresholds, seed, show)
     yield first
     if count <= MAX_TRIAL_PHOTOS:

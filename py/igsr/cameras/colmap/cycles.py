@@ -46,7 +46,7 @@ class _Relative:
 def consistent_databases(database: Path) -> Iterator[Path]:
     """Copy a database with each of the best focal lengths, without the pairs that contradict it.
 
-    Focal lengths of EXIF stay. There is no copy if photos have no cycles.
+    Focal lengths of EXIF stay. Photos without cycles have no copy.
 
     Args:
         database: from ``with_focal_lengths``.
