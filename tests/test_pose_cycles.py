@@ -27,7 +27,7 @@ ALIKE = (0, 3)
 
 @pytest.fixture
 def database(tmp_path):
-    """Matches of neighbors around an object, a fifth of them also in the next photo."""
+    """Matches of neighbors around an object, a few of them also in the next photo."""
     random = np.random.default_rng(0)
     photos = [Photo(f"{i}.png", np.zeros((SIZE, SIZE, 3), np.uint8)) for i in range(COUNT)]
     keypoints = [[] for _ in photos]
@@ -47,9 +47,9 @@ def database(tmp_path):
     for i in range(COUNT):
         xyz = random.normal(scale=0.4, size=(120, 3))
         j, k = (i + 1) % COUNT, (i + 2) % COUNT
-        of_i, of_j, of_k = add(i, xyz), add(j, xyz), add(k, xyz[:24])
+        of_i, of_j, of_k = add(i, xyz), add(j, xyz), add(k, xyz[:8])
         match(i, j, of_i, of_j)
-        match(j, k, of_j[:24], of_k)
+        match(j, k, of_j[:8], of_k)
     turned = random.normal(scale=0.4, size=(60, 3))
     match(*ALIKE, add(ALIKE[0], turned), add(ALIKE[1], turned * [-1.0, 1.0, -1.0]))
     path = tmp_path / "matched.db"
