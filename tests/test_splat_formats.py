@@ -3,6 +3,7 @@
 import json
 import os
 import warnings
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -157,3 +158,67 @@ def test_ignored_parts_of_a_file_are_warnings(tmp_path):
     path.write_text(json.dumps(document))
     with pytest.warns(UserWarning, match="without splats"):
         assert len(igsr.Splats.load(path)) == 40
+
+
+def foreign_ply(path, *, comment="", dtype="<f4", scales=3):
+    """A .ply of three splats by another program."""
+    names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
+    names += [f"scale_{k}" for k in range(scales)] + [f"rot_{k}" for k in range(4)]
+    values = np.random.default_rng(0).normal(size=(3, len(names))).astype(dtype)
+    kind = {"<f4": "float", "<f8": "double"}[dtype]
+    lines = ["ply", "format binary_little_endian 1.0", f"comment {comment}", "element vertex 3"]
+    lines += [f"property {kind} {name}" for name in names] + ["end_header", ""]
+    path.write_bytes("\n".join(lines).encode() + values.tobytes())
+    return values
+
+
+@pytest.mark.parametrize(
+    ("comment", "antialiased"),
+    [
+        ("antialiased", True),
+        ("antialiased 1", True),
+        ("antialiased 0", False),
+        ("SplatRenderMode: mip", True),
+        ("SplatRenderMode: default", False),
+        ("origin unknown", False),
+        ("origin 1 2 inf", False),
+    ],
+)
+def test_comments_of_other_programs(tmp_path, comment, antialiased):
+    foreign_ply(tmp_path / "a.ply", comment=comment)
+    splats = igsr.Splats.load(tmp_path / "a.ply")
+    assert (splats.antialiased, splats.origin.tolist()) == (antialiased, [0.0, 0.0, 0.0])
+    splats.save(tmp_path / "b.ply")
+    assert (b"comment SplatRenderMode: mip\n" in (tmp_path / "b.ply").read_bytes()) == antialiased
+
+
+def test_doubles_are_read_and_flat_splats_are_named(tmp_path):
+    values = foreign_ply(tmp_path / "a.ply", dtype="<f8")
+    splats = igsr.Splats.load(tmp_path / "a.ply")
+    assert np.array_equal(splats.means, values[:, :3].astype(np.float32))
+    assert np.array_equal(splats.quats, values[:, -4:].astype(np.float32))
+    foreign_ply(tmp_path / "a.ply", scales=2)
+    with pytest.raises(igsr.IgsrError, match=r"a\.ply: has flat splats of 2DGS"):
+        igsr.Splats.load(tmp_path / "a.ply")
+
+
+def test_an_unknown_required_extension_is_named(tmp_path):
+    path = tmp_path / "a.gltf"
+    scenes.splats().save(path)
+    document = json.loads(path.read_text())
+    document["extensionsRequired"] = [*document.get("extensionsRequired", []), "EXT_other"]
+    path.write_text(json.dumps(document))
+    with pytest.raises(igsr.IgsrError, match=r"a\.gltf: requires EXT_other, which igsr cannot"):
+        igsr.Splats.load(path)
+
+
+def test_another_tag_of_antialiased_splats_in_sog(tmp_path):
+    scenes.splats(degree=0).save(tmp_path / "a.sog")
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    meta = json.loads(files["meta.json"]) | {"model": "antialiased"}
+    meta.pop("antialias", None)
+    with zipfile.ZipFile(tmp_path / "b.sog", "w") as archive:
+        for name, content in (files | {"meta.json": json.dumps(meta).encode()}).items():
+            archive.writestr(name, content)
+    assert igsr.Splats.load(tmp_path / "b.sog").antialiased

@@ -2,7 +2,8 @@
 //!
 //! Properties: x y z, nx ny nz (zero), f_dc_0..2, f_rest_* (all red, then green, then blue), opacity
 //! (logit), scale_0..2 (logs), rot_0..3 (wxyz). A header line `comment origin X Y Z` holds a nonzero f64
-//! origin, and means are then relative to it; `comment antialiased` marks antialiased opacities.
+//! origin, and means are then relative to it; `comment SplatRenderMode: mip` marks antialiased opacities.
+//! Doubles are read, too.
 
 use std::io::{BufRead, Write};
 
@@ -14,16 +15,19 @@ use crate::error::Result;
 use crate::sh;
 use crate::splats::SplatArrays;
 
+/// First byte in a row, and whether it is a double.
+type Column = (usize, bool);
+
 /// Columns of a splat's numbers in the rows of a `.ply`.
 pub struct Rows {
     pub count: usize,
     pub degree: u32,
-    xyz: Vec<usize>,
-    quat: Vec<usize>,
-    scale: Vec<usize>,
-    opacity: Vec<usize>,
-    dc: Vec<usize>,
-    rest: Vec<usize>,
+    xyz: Vec<Column>,
+    quat: Vec<Column>,
+    scale: Vec<Column>,
+    opacity: Vec<Column>,
+    dc: Vec<Column>,
+    rest: Vec<Column>,
     row: Vec<u8>,
 }
 
@@ -38,24 +42,23 @@ impl Rows {
             return Err(named.bad("holds lists in its vertices; it is a mesh, not splats"));
         }
         let need = |name: &str| {
-            vertex.offset(name, Kind::Float).ok_or_else(|| {
-                named.bad(format!(
+            let float = vertex.offset(name, Kind::Float).map(|at| (at, false));
+            let column = float.or(vertex.offset(name, Kind::Double).map(|at| (at, true)));
+            column.ok_or_else(|| match name {
+                "scale_2" => named.bad("has flat splats of 2DGS; only 3DGS's can be read"),
+                _ => named.bad(format!(
                     "has no float property '{name}'; it is not a .ply of Gaussian splats"
-                ))
+                )),
             })
         };
         let columns =
-            |names: &[&str]| -> Result<Vec<usize>> { names.iter().map(|n| need(n)).collect() };
+            |names: &[&str]| -> Result<Vec<Column>> { names.iter().map(|n| need(n)).collect() };
         let xyz = columns(&["x", "y", "z"])?;
         let quat = columns(&["rot_0", "rot_1", "rot_2", "rot_3"])?;
         let scale = columns(&["scale_0", "scale_1", "scale_2"])?;
         let opacity = columns(&["opacity"])?;
         let dc = columns(&["f_dc_0", "f_dc_1", "f_dc_2"])?;
-        let rest_count = vertex
-            .properties
-            .iter()
-            .filter(|p| p.kind == Kind::Float && p.name.starts_with("f_rest_"))
-            .count();
+        let rest_count = vertex.properties.iter().filter(|p| p.name.starts_with("f_rest_")).count();
         let degree = (0..=SH_DEGREE_MAX)
             .find(|&d| 3 * (sh::coeffs(d) - 1) == rest_count)
             .ok_or_else(|| {
@@ -63,7 +66,7 @@ impl Rows {
                     "has {rest_count} f_rest properties, which match no SH degree in 0..=4"
                 ))
             })?;
-        let rest: Vec<usize> =
+        let rest: Vec<Column> =
             (0..rest_count).map(|k| need(&format!("f_rest_{k}"))).collect::<Result<_>>()?;
         if vertex.size() > size {
             return Err(named.bad(format!(
@@ -87,7 +90,10 @@ impl Rows {
         reader.read_exact(&mut self.row).map_err(|_| {
             named.bad(format!("ends at splat {number} of {}; it is truncated", self.count))
         })?;
-        let at = |offset: usize| f32_at(&self.row, offset);
+        let at = |(offset, is_double): Column| match is_double {
+            false => f32_at(&self.row, offset),
+            true => self.row[offset..].first_chunk().map_or(0.0, |&b| f64::from_le_bytes(b) as f32),
+        };
         let stride = splats.stride();
         splats.means[i] = std::array::from_fn(|k| at(self.xyz[k]));
         splats.quats[i] = std::array::from_fn(|k| at(self.quat[k]));

@@ -13,6 +13,7 @@ const HEADER_MAX: u64 = 1 << 16;
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
     Float,
+    Double,
     Uint,
     Uchar,
     Other,
@@ -27,7 +28,7 @@ fn scalar(name: &str) -> Option<(usize, Kind)> {
         "uint" | "uint32" => (4, Kind::Uint),
         "int" | "int32" => (4, Kind::Other),
         "float" | "float32" => (4, Kind::Float),
-        "double" | "float64" => (8, Kind::Other),
+        "double" | "float64" => (8, Kind::Double),
         _ => return None,
     })
 }
@@ -69,7 +70,7 @@ pub struct Header {
     pub elements: Vec<Element>,
     /// `comment origin X Y Z`, else zero.
     pub origin: [f64; 3],
-    /// `comment antialiased`.
+    /// `comment SplatRenderMode: mip`.
     pub antialiased: bool,
 }
 
@@ -104,13 +105,16 @@ impl Header {
                         )));
                     }
                 }
-                ["comment", "antialiased"] => header.antialiased = true,
+                // Of earlier versions of igsr and of Postshot; of Brush, gsplat and nerfstudio.
+                ["comment", "antialiased"]
+                | ["comment", "antialiased", "1"]
+                | ["comment", "SplatRenderMode:", "mip"] => header.antialiased = true,
                 ["comment", "origin", xyz @ ..] => {
-                    let values: Option<Vec<f64>> = xyz.iter().map(|v| v.parse().ok()).collect();
-                    header.origin = values
-                        .and_then(|v| <[f64; 3]>::try_from(v).ok())
-                        .filter(|v| v.iter().all(|c| c.is_finite()))
-                        .ok_or_else(|| named.bad("has an origin that is not three numbers"))?;
+                    let values = xyz.iter().map(|v| v.parse().ok().filter(|v: &f64| v.is_finite()));
+                    let values = values.collect::<Option<Vec<f64>>>();
+                    // Comments of other programs may start with the same word.
+                    let origin = values.and_then(|v| <[f64; 3]>::try_from(v).ok());
+                    header.origin = origin.unwrap_or(header.origin);
                 }
                 ["element", name, count] => {
                     let count =
@@ -167,7 +171,7 @@ pub fn write_comments(out: &mut impl Write, file: &SplatFile) -> std::io::Result
         writeln!(out, "comment origin {x:?} {y:?} {z:?}")?;
     }
     if file.antialiased {
-        writeln!(out, "comment antialiased")?;
+        writeln!(out, "comment SplatRenderMode: mip")?;
     }
     Ok(())
 }

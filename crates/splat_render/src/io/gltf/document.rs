@@ -8,7 +8,7 @@ use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use serde_json::Value;
 
-use super::{CHUNK_BINARY, CHUNK_JSON, MAGIC, TEXT_MAX};
+use super::{CHUNK_BINARY, CHUNK_JSON, EXTENSION, MAGIC, TEXT_MAX};
 use crate::error::Result;
 use crate::io::bytes::{Bytes, Named, u32_at};
 use crate::io::{Format, limits, open_file};
@@ -41,6 +41,13 @@ impl<'a> Document<'a> {
         let json: Value = serde_json::from_slice(text)
             .map_err(|e| named.bad(format!("holds JSON that cannot be read ({e})")))?;
         let mut document = Self { json, buffers: Vec::new(), stores: Vec::new(), named: *named };
+        let names =
+            |value: &Value| value.as_str().filter(|&name| name != EXTENSION).map(String::from);
+        if let Some(name) = document.list("extensionsRequired").iter().find_map(names) {
+            return Err(named.bad(format!(
+                "requires {name}, which igsr cannot read; save it without, or as .ply"
+            )));
+        }
         let mut files = HashMap::new();
         for k in 0..document.list("buffers").len() {
             let store = document.buffer(k, binary, &mut files)?;

@@ -90,7 +90,9 @@ impl Meta {
         let [quats] = meta.get("quats").and_then(files).ok_or_else(|| missing("quats.files"))?;
         Ok(Self {
             count: meta.get("count").and_then(Value::as_u64).ok_or_else(|| missing("count"))?,
-            antialiased: meta.get("antialias").and_then(Value::as_bool).unwrap_or(false),
+            // The second is GaussForge's.
+            antialiased: meta.get("antialias").and_then(Value::as_bool).unwrap_or(false)
+                || meta.get("model").and_then(Value::as_str) == Some("antialiased"),
             low: bounds("mins").ok_or_else(|| missing("means.mins"))?,
             high: bounds("maxs").ok_or_else(|| missing("means.maxs"))?,
             means: meta.get("means").and_then(files).ok_or_else(|| missing("means.files"))?,
