@@ -243,11 +243,12 @@ def _is_confirmed(model: Any | None, start: Path, matches: Path, aliked: bool) -
     """
     if model is None:
         return False
-    photos = {photo for pair in links(start) for photo in pair}
+    verified = links(matches)
+    photos = {photo for pair in verified for photo in pair}
     return (
         photos <= set(model.reg_image_ids())
         and _candidate(model, start).is_good
-        and not (aliked and missing_matches(model, links(matches), matches))
+        and not (aliked and missing_matches(model, verified, matches))
     )
 
 
