@@ -128,6 +128,11 @@ def test_convert_reports_lost_data(tmp_path):
     assert report["bytes"] == target.stat().st_size == 40 * 32
     told = json.loads(CliRunner().invoke(app, ["info", str(target), "--json"]).stdout)
     assert (told["splats"], told["sh_degree"], told["antialiased"]) == (40, 0, False)
+    splats.means[:3] = np.nan
+    splats.save(scene)
+    done = CliRunner().invoke(app, ["convert", str(scene), str(target)])
+    assert f"37 splats in {target}" in done.stdout
+    assert "3 splats that cannot be drawn" in done.stderr
 
 
 @pytest.mark.parametrize(

@@ -122,10 +122,12 @@ def _converted_scene(
         notes = write_scene_page(target, splats, shown, color, source.stem)
     else:
         notes = splats.save(target)
+    # A note may be about splats that are left out.
+    written = len(Splats.load(target)) if notes and not is_page else len(splats)
     return {
         "scene": str(source),
         "target": str(target),
-        "splats": len(splats),
+        "splats": written,
         "sh_degree": splats.sh_degree,
         "antialiased": splats.antialiased,
         "bytes_before": source.stat().st_size,
