@@ -146,7 +146,7 @@ def mapped(
             extend(model, count, database, thresholds, seed, show)
             found = _candidate(model, matches)
         else:
-            found = _mapped_once(count, matches, database, thresholds, seed, show, aliked)
+            found = _mapped_once(count, matches, database, thresholds, seed, show, sift, aliked)
         for remapping in range(MAX_REMAPPINGS):
             wrong = _wrong_links(found, matches, source, strengths, usable or {}, aliked)
             if not wrong:
@@ -161,7 +161,7 @@ def mapped(
             database = with_focal_lengths(source, seed)
             # Mapped again, because an extended model would keep its wrong cameras.
             best = None
-            found = _mapped_once(count, matches, database, thresholds, seed, show, aliked)
+            found = _mapped_once(count, matches, database, thresholds, seed, show, sift, aliked)
         better = found is not None and (best is None or found.agreed > best.agreed)
         if better:
             best, best_attempt = found, attempt
@@ -192,11 +192,12 @@ def _mapped_once(
     thresholds: Thresholds,
     seed: int,
     show: Progress,
+    sift: bool,
     aliked: bool,
 ) -> _Candidate | None:
     """The model with which most matches agree, until nearly all agree with one of all photos."""
     best: _Candidate | None = None
-    for model in _models(count, matches, database, thresholds, seed, show, aliked):
+    for model in _models(count, matches, database, thresholds, seed, show, sift, aliked):
         if model is not None and has_usual_focals(model, database):
             found = _candidate(model, matches)
             if best is None or found.agreed > best.agreed:
@@ -213,6 +214,7 @@ def _models(
     thresholds: Thresholds,
     seed: int,
     show: Progress,
+    sift: bool,
     aliked: bool,
 ) -> Iterator[Any | None]:
     """Models of the incremental and the global mapper, also with other focal lengths."""
@@ -222,8 +224,9 @@ def _models(
         # It places photos that only one pair connects at a wrong distance: nothing disagrees.
         if first is not None and not _candidate(first, matches).is_good:
             yield map_globally(database, thresholds, seed)
-        is_new = thresholds in (THRESHOLDS[0], THRESHOLDS[FIRST_DOUBTFUL - 1])
-        for start in consistent_databases(database) if is_new else ():
+        # Their models have few points, so the others come first, with SIFT's guided matches.
+        after = THRESHOLDS[FIRST_DOUBTFUL - (1 if sift else 2) : FIRST_DOUBTFUL]
+        for start in consistent_databases(database) if thresholds in after else ():
             yield from (
                 model
                 for model in (
