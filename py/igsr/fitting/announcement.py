@@ -1,4 +1,4 @@
-"""What a run announces before slow work: the photos, the steps and the estimated time."""
+"""Sentences before slow work: the photos, the steps and the estimated time."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def announcement(
     cameras_known: bool,
     rounds: int = 0,
 ) -> list[str]:
-    """Return three sentences: what was found, what will be done, and how long it takes.
+    """Return three sentences: about the photos, the work and its time.
 
     Args:
         seen: the photos.

@@ -231,7 +231,7 @@ def _are_near(views: list[View], points: Points | None) -> bool:
 
 def _splats_at(xyz: Float64, colors: Float64, confidence: Float64 | None, sh_degree: int) -> Splats:
     """A splat at each point [P, 3] with its color [P, 3]."""
-    # Relative to the median, so that float32 is precise where the scene is.
+    # Relative to the median, so that float32 is precise near the scene.
     origin = np.median(xyz, axis=0)
     arrays = _core.splats_from_points(
         (xyz - origin).astype(np.float32), colors.astype(np.float32), sh_degree
