@@ -87,10 +87,11 @@ def test_attempts_of_eight_photos(
 ):
     calls = []
 
-    def make(count, database, evidence, *_):
+    def candidates(task, database, evidence):
         step = THRESHOLDS.index(evidence)
         calls.append(f"map {step} {database.stem}")
-        return Model(*range(models[step])) if step in models else None
+        if step in models:
+            yield attempts._candidate(Model(*range(models[step])), task.matches)
 
     def add(model, count, database, evidence, *_):
         step = THRESHOLDS.index(evidence)
@@ -113,7 +114,7 @@ def test_attempts_of_eight_photos(
     monkeypatch.setattr(attempts, "links", lambda path: found)
     monkeypatch.setattr(attempts, "contradictions", lambda model, matches, usable: set())
     monkeypatch.setattr(attempts, "agreeing", agreed)
-    monkeypatch.setattr(attempts, "_models", lambda count, _, *more: iter([make(count, *more)]))
+    monkeypatch.setattr(attempts, "_candidates", candidates)
     monkeypatch.setattr(attempts, "has_usual_focals", lambda model, database: True)
     monkeypatch.setattr(attempts, "matched_along_lines", look)
     monkeypatch.setattr(attempts, "extend", add)

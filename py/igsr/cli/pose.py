@@ -83,9 +83,8 @@ def pose_command(
         f"{len(report['cameras'])} of {report['photos']} photos placed by {report['estimator']} "
         f"in {report['seconds']:.1f} s, {report['points']} points, seed {seed}"
     )
-    console.print(
-        "  ".join(map(str, [out, *sorted(out.glob("*.png"))] if plot else [out])), style="dim"
-    )
+    drawn = ["poses.png", "matches.png"] if report["placed_by"] else ["poses.png"]
+    console.print("  ".join(map(str, [out, *(out / name for name in drawn if plot)])), style="dim")
 
 
 def _posed(

@@ -97,6 +97,18 @@ class _Candidate:
     is_good: bool
 
 
+@dataclass(frozen=True)
+class _Task:
+    """The arguments of ``mapped`` that all attempts share."""
+
+    count: int
+    matches: Path
+    seed: int
+    show: Progress
+    sift: bool
+    aliked: bool
+
+
 def mapped(
     count: int,
     matches: Path,
@@ -124,6 +136,7 @@ def mapped(
     all_links = len(strengths)
     hopeless = set(range(count)) - {image - image_id(0) for pair in strengths for image in pair}
     source, database = matches, with_focal_lengths(matches, seed)
+    task = _Task(count, matches, seed, show, sift, aliked)
     best: _Candidate | None = None
     best_attempt = 0
     guided: set[int] = set()
@@ -146,7 +159,7 @@ def mapped(
             extend(model, count, database, thresholds, seed, show)
             found = _candidate(model, matches)
         else:
-            found = _mapped_once(count, matches, database, thresholds, seed, show, sift, aliked)
+            found = _mapped_once(task, database, thresholds)
         for remapping in range(MAX_REMAPPINGS):
             wrong = _wrong_links(found, matches, source, strengths, usable or {}, aliked)
             if not wrong:
@@ -161,7 +174,7 @@ def mapped(
             database = with_focal_lengths(source, seed)
             # Mapped again, because an extended model would keep its wrong cameras.
             best = None
-            found = _mapped_once(count, matches, database, thresholds, seed, show, sift, aliked)
+            found = _mapped_once(task, database, thresholds)
         better = found is not None and (best is None or found.agreed > best.agreed)
         if better:
             best, best_attempt = found, attempt
@@ -185,58 +198,44 @@ def mapped(
     return Mapped(model, best_attempt >= FIRST_DOUBTFUL, all_links - len(strengths), others)
 
 
-def _mapped_once(
-    count: int,
-    matches: Path,
-    database: Path,
-    thresholds: Thresholds,
-    seed: int,
-    show: Progress,
-    sift: bool,
-    aliked: bool,
-) -> _Candidate | None:
+def _mapped_once(task: _Task, database: Path, thresholds: Thresholds) -> _Candidate | None:
     """The model with which most matches agree, until nearly all agree with one of all photos."""
     best: _Candidate | None = None
-    for model in _models(count, matches, database, thresholds, seed, show, sift, aliked):
-        if model is not None and has_usual_focals(model, database):
-            found = _candidate(model, matches)
+    for found in _candidates(task, database, thresholds):
+        if found is not None and has_usual_focals(found.model, database):
             if best is None or found.agreed > best.agreed:
                 best = found
-            if found.is_good and not _missing(found, count):
+            if found.is_good and not _missing(found, task.count):
                 break
     return best
 
 
-def _models(
-    count: int,
-    matches: Path,
-    database: Path,
-    thresholds: Thresholds,
-    seed: int,
-    show: Progress,
-    sift: bool,
-    aliked: bool,
-) -> Iterator[Any | None]:
+def _candidates(task: _Task, database: Path, thresholds: Thresholds) -> Iterator[_Candidate | None]:
     """Models of the incremental and the global mapper, also with other focal lengths."""
-    first = map_photos(count, database, thresholds, seed, show)
+    count, matches, seed, show = task.count, task.matches, task.seed, task.show
+
+    def judged(model: Any | None) -> _Candidate | None:
+        return None if model is None else _candidate(model, matches)
+
+    first = judged(map_photos(count, database, thresholds, seed, show))
     yield first
     if count <= MAX_TRIAL_PHOTOS:
         # It places photos that only one pair connects at a wrong distance: nothing disagrees.
-        if first is not None and not _candidate(first, matches).is_good:
-            yield map_globally(database, thresholds, seed)
+        if first is not None and not first.is_good:
+            yield judged(map_globally(database, thresholds, seed))
         # Their models have few points, so the others come first, with SIFT's guided matches.
-        after = THRESHOLDS[FIRST_DOUBTFUL - (1 if sift else 2) : FIRST_DOUBTFUL]
+        after = THRESHOLDS[FIRST_DOUBTFUL - (1 if task.sift else 2) : FIRST_DOUBTFUL]
         for start in consistent_databases(database) if thresholds in after else ():
             yield from (
-                model
+                judged(model)
                 for model in (
                     map_globally(start, thresholds, seed),
                     map_photos(count, start, thresholds, seed, show),
                 )
-                if _is_confirmed(model, start, matches, aliked)
+                if _is_confirmed(model, start, matches, task.aliked)
             )
         for start in with_other_focal_lengths(database, FOCALS):
-            yield map_photos(count, start, thresholds, seed, show)
+            yield judged(map_photos(count, start, thresholds, seed, show))
 
 
 def _is_confirmed(model: Any | None, start: Path, matches: Path, aliked: bool) -> bool:

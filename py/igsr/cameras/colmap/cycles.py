@@ -82,11 +82,9 @@ def cycle_errors(relative: Mapping[Pair, tuple[Float64, int]]) -> dict[Pair, flo
     for (a, b), (turn, _) in sorted(relative.items(), key=lambda row: (-row[1][1], row[0])):
         if group[a] is not group[b]:
             change = rotation[b].T @ turn @ rotation[a]
-            for photo in group[b]:
-                rotation[photo] = rotation[photo] @ change
-                if photo != b:
-                    group[photo] = group[a]
-            moved, group[b] = group[b], group[a]
+            moved = group[b]
+            for photo in moved:
+                rotation[photo], group[photo] = rotation[photo] @ change, group[a]
             group[a].extend(moved)
     return {
         (a, b): _degrees(rotation[b].T @ turn @ rotation[a])
