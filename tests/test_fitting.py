@@ -363,7 +363,7 @@ def test_resume_refuses_other_versions(capture, finished, tmp_path):
     path = tmp_path / "other.npz"
     for other, message in (
         ({"igsr": "0.0.9"}, r"was made with igsr '0\.0\.9', not"),
-        ({"format": 2}, "it is not of format 1"),
+        ({"format": 1}, "it is not of format 2"),
     ):
         save_checkpoint(path, state, settings | other)
         assert_refused(message, fit_capture, capture, checkpoint=path, resume=True, **SHORT)
@@ -409,7 +409,7 @@ def test_damaged_checkpoints_are_refused(capture, finished, tmp_path):
         save_checkpoint(path, arrays, settings)
         check_refused("cannot be used")
     for seconds in ("abc", [1.0], None, float("inf"), 1):
-        text = json.dumps({"format": 1, **settings, "seconds": seconds}).encode()
+        text = json.dumps({"format": 2, **settings, "seconds": seconds}).encode()
         np.savez(path, **state, settings=np.frombuffer(text, dtype=np.uint8))
         check_refused("seconds")
     for started in (None, "rays", ["rays"], ["rays", 1.5], [1, "rays"]):

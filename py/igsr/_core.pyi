@@ -212,7 +212,7 @@ def time_pipeline(
 ) -> dict[str, Float64]:
     """Milliseconds [repeats] of each of the four stages; arrays are converted once."""
 
-NEAR_PLANE: float  # splats nearer than this are culled, world units
+NEAR_PLANE: float  # default near plane of rasterization, world units
 FAR_PLANE: float  # splats farther than this are culled, world units
 EPS2D: float  # variance in square pixels added to every projected Gaussian
 JACOBIAN_MARGIN: float  # part of tan(fov / 2) beyond each edge at which x/z and y/z are clamped
@@ -360,6 +360,11 @@ def read_level(path: str, most: int) -> dict[str, Any]:
     Returns ``SplatArrays``, antialiased (bool) and level (its number). Raises OSError where a file
     cannot be read, or the coarsest level has more.
     """
+
+def splat_extent(
+    means: Float32, opacities: Float32
+) -> tuple[tuple[float, float, float], float, float]:
+    """Center of visible splats, their radius, and the near plane of pictures."""
 
 def morton_order(points: Float32) -> npt.NDArray[np.int64]:
     """Ids of points [N, 3] along Morton's curve, as the writers order splats."""

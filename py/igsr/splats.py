@@ -165,6 +165,20 @@ class Splats(ArrayEquality, NotebookPicture):
             return None
         return world.min(axis=0), world.max(axis=0)
 
+    @property
+    def extent(self) -> tuple[npt.NDArray[np.float64], float, float]:
+        """Center, radius and near plane for renders, without the backdrop, world units.
+
+        Returns:
+            The median of the visible splats, float64 [3], relative to ``origin``; the radius that
+            contains 90 % of them, at most four times the radius that contains 50 %; and the
+            distance in front of a camera from which splats are drawn, a 500th of the radius.
+        """
+        count = len(self) - self.backdrop_splats
+        arrays = (np.ascontiguousarray(array[:count]) for array in (self.means, self.opacities))
+        center, radius, near = _core.splat_extent(*arrays)
+        return np.array(center), radius, near
+
     def to_torch(
         self,
         device: torch.device | str | None = None,

@@ -6,9 +6,10 @@ use numpy::{IntoPyArray, PyArray1};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
+use splat_render::extent::{extent, near_plane};
 use splat_render::io::SplatFile;
 
-use crate::arrays::{array, row, rows, shaped};
+use crate::arrays::{array, elements, row, rows, shaped};
 use crate::error::to_python;
 use crate::splat_arrays::{set_splat_arrays, splat_arrays_from};
 
@@ -41,6 +42,21 @@ pub fn write_splats(
         antialiased: entry("antialiased")?.extract()?,
     };
     py.detach(|| splat_render::io::write_splats(&path, &file)).map_err(to_python)
+}
+
+/// Center [3] of visible splats, relative to their origin, their radius, and the near plane of pictures.
+#[pyfunction]
+pub fn splat_extent(
+    py: Python<'_>,
+    means: &Bound<'_, PyAny>,
+    opacities: &Bound<'_, PyAny>,
+) -> PyResult<([f64; 3], f64, f32)> {
+    let means = array::<f32>("means", means)?;
+    let means = rows::<f32, 3>("means", &means, &[-1])?;
+    let opacities = array::<f32>("opacities", opacities)?;
+    let opacities = elements("opacities", &opacities, &[means.len() as isize])?;
+    let (center, radius) = py.detach(|| extent(means, opacities));
+    Ok((center.to_array(), radius, near_plane(radius)))
 }
 
 /// Ids of points, N x 3, along Morton's curve, as the writers order splats.

@@ -27,6 +27,7 @@ pub mod camera;
 pub mod constants;
 pub mod cpu;
 pub mod error;
+pub mod extent;
 pub mod fit;
 pub mod fit_device;
 pub mod gpu;

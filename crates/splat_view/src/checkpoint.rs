@@ -31,17 +31,22 @@ pub fn read_checkpoint(path: &Path) -> Result<SplatFile> {
     let stride = sh_shape.get(1).copied().unwrap_or(0);
     let degree = (0..=SH_DEGREE_MAX).find(|&d| sh::coeffs(d) == stride);
     let sh_degree = degree.ok_or_else(|| bad(format!("{stride} SH coefficients")))?;
-    // Captures at the world's origin store none.
-    let origin = match read_doubles(&mut archive, "origin").map_err(&bad)?[..] {
-        [] => [0.0; 3],
-        [x, y, z] if [x, y, z].iter().all(|v| v.is_finite()) => [x, y, z],
-        _ => return Err(bad("its origin is not three finite numbers".to_owned())),
+    let mut doubles = |name: &str| read_doubles(&mut archive, name).map_err(&bad);
+    let (origin, frame) = (doubles("origin")?, doubles("frame")?);
+    let ([x, y, z], [at @ .., unit]) = (&origin[..], &frame[..]) else {
+        return Err(bad("its origin is not three numbers".to_owned()));
     };
+    if at.len() != 3 || !origin.iter().chain(&frame).all(|v| v.is_finite()) || *unit <= 0.0 {
+        return Err(bad("its frame is not three finite numbers and a unit".to_owned()));
+    }
+    // The fit's frame is in the world at `at`, in lengths of `unit`.
+    let origin = [at[0] + unit * x, at[1] + unit * y, at[2] + unit * z];
+    let longer = |v: f32| (f64::from(v) * unit) as f32;
     let rows = |values: Vec<f32>| values.chunks_exact(3).map(|v| [v[0], v[1], v[2]]).collect();
     let splats = SplatArrays {
-        means: rows(means),
+        means: rows(means.into_iter().map(longer).collect()),
         quats: quats.chunks_exact(4).map(|v| [v[0], v[1], v[2], v[3]]).collect(),
-        scales: rows(scales),
+        scales: rows(scales.into_iter().map(|v| v + unit.ln() as f32).collect()),
         opacities,
         sh: rows(sh_rows),
         sh_degree,

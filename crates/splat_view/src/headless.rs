@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use splat_render::cpu::Cpu;
+use splat_render::extent::near_plane;
 use splat_render::gpu::Gpu;
 use splat_render::gpu_check::open_tested;
 use splat_render::io::SplatFile;
@@ -16,7 +17,7 @@ use crate::display::Settings;
 use crate::model::Model;
 use crate::painter::{Painter, Shot, check_size};
 use crate::picture_files::{to_bytes, write_exr, write_png};
-use crate::scene_view::{background, cameras_of, first_camera, first_view, near, up};
+use crate::scene_view::{background, cameras_of, first_camera, first_view, up};
 use crate::sources::find_sources;
 use crate::stage_times::STAGES;
 use crate::start::no_levels;
@@ -106,7 +107,7 @@ impl Scene {
         let fov = arguments.fov.map(f64::to_radians);
         let background = background(arguments, Some(path));
         let mut settings = Settings { background, ..Settings::default() };
-        settings.near = arguments.near.unwrap_or_else(|| near(&model));
+        settings.near = arguments.near.unwrap_or_else(|| near_plane(model.radius));
         settings.drawing = arguments.drawing;
         settings.fov = fov.unwrap_or(settings.fov);
         let mut viewpoint = first_view(&model, &cameras, up, settings.fov);

@@ -3,16 +3,12 @@
 use std::path::Path;
 
 use glam::DVec3;
+use splat_render::extent::extent;
 use splat_render::io::{SplatFile, read_splats};
 use splat_render::{Error, Result};
 
 use crate::checkpoint::read_checkpoint;
 use crate::detail::{BUDGET, Detail, is_in_levels};
-
-/// Splats of a lower opacity logit do not count for the extent.
-const FAINT_LOGIT: f32 = -2.2;
-/// Number of splats that the extent is computed from.
-const SAMPLES: usize = 100_000;
 
 #[derive(Debug)]
 pub struct Model {
@@ -55,7 +51,8 @@ impl Model {
                 file.splats.len()
             ));
         }
-        let (center, radius) = extent(&file);
+        let (center, radius) = extent(&file.splats.means, &file.splats.opacities);
+        let center = center + DVec3::from(file.origin);
         Self { file, center, radius, notes, detail: None, whole: None }
     }
 }
@@ -66,33 +63,4 @@ fn is_finite(file: &SplatFile, i: usize) -> bool {
     s.means[i].iter().chain(&s.quats[i]).chain(&s.scales[i]).all(|v| v.is_finite())
         && s.opacities[i].is_finite()
         && s.sh[i * stride..(i + 1) * stride].iter().flatten().all(|v| v.is_finite())
-}
-
-/// The value at a fraction of the way from the least to the greatest.
-fn quantile(values: &mut [f64], part: f64) -> f64 {
-    if values.is_empty() {
-        return 0.0;
-    }
-    let at = ((values.len() - 1) as f64 * part) as usize;
-    *values.select_nth_unstable_by(at, f64::total_cmp).1
-}
-
-/// Center and radius. Medians, because captures have a few splats very far out.
-fn extent(file: &SplatFile) -> (DVec3, f64) {
-    let step = file.splats.len().div_ceil(SAMPLES).max(1);
-    let finite = (0..file.splats.len()).step_by(step).filter(|&i| is_finite(file, i));
-    let all: Vec<usize> = finite.collect();
-    let clear = |&i: &usize| file.splats.opacities[i] > FAINT_LOGIT;
-    let mut seen: Vec<usize> = all.iter().copied().filter(clear).collect();
-    if seen.is_empty() {
-        seen = all;
-    }
-    let at = |i: usize| DVec3::from(file.splats.means[i].map(f64::from));
-    let middle =
-        |axis: usize| quantile(&mut seen.iter().map(|&i| at(i)[axis]).collect::<Vec<_>>(), 0.5);
-    let center = DVec3::new(middle(0), middle(1), middle(2));
-    let mut distances: Vec<f64> = seen.iter().map(|&i| at(i).distance(center)).collect();
-    let radius = quantile(&mut distances, 0.9).min(4.0 * quantile(&mut distances, 0.5));
-    let radius = if radius > 0.0 { radius } else { 1.0 };
-    (center + DVec3::from(file.origin), radius)
 }

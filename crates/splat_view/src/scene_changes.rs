@@ -2,11 +2,12 @@
 
 use std::path::{Path, PathBuf};
 
+use splat_render::extent::near_plane;
 use splat_render::Result;
 
 use crate::detail::view;
 use crate::loader::Loaded;
-use crate::scene_view::{background, cameras_of, first_camera, first_view, near, up};
+use crate::scene_view::{background, cameras_of, first_camera, first_view, up};
 use crate::session::{Session, Wake};
 use crate::sources::{Source, find_sources, stamp};
 use crate::start::Start;
@@ -72,7 +73,7 @@ impl Session {
             viewer.viewpoint = first_view(&model, &viewer.cameras, viewer.up, viewer.settings.fov);
             viewer.is_placed = true;
             if self.arguments.near.is_none() {
-                viewer.settings.near = near(&model);
+                viewer.settings.near = near_plane(model.radius);
             }
         }
         let streaming = model.detail.take().map(|detail| {

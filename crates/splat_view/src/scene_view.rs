@@ -3,7 +3,6 @@
 use std::path::Path;
 
 use glam::DVec3;
-use splat_render::constants::NEAR;
 use splat_render::{Error, Result};
 
 use crate::arguments::Arguments;
@@ -12,9 +11,6 @@ use crate::model::Model;
 use crate::surroundings::{background_beside, cameras_beside};
 use crate::up_axis::up_of_splats;
 use crate::viewpoint::{Viewpoint, up_of};
-
-/// Near plane of small scenes, as a fraction of their radius.
-const NEAR_PART: f64 = 0.05;
 
 /// The named cameras, else the scene's fit's; a note reports unreadable ones.
 pub fn cameras_of(
@@ -65,12 +61,6 @@ pub fn first_camera(arguments: &Arguments, cameras: &[CaptureCamera]) -> Result<
     }
     let is_photo = arguments.fov.is_none() && !cameras.is_empty();
     Ok(is_photo.then_some(0))
-}
-
-/// Near plane of a scene, smaller for small scenes: a scene is seen from three times its radius.
-pub fn near(model: &Model) -> f32 {
-    let own = (NEAR_PART * model.radius) as f32;
-    own.clamp(f32::MIN_POSITIVE, NEAR)
 }
 
 /// First view of a scene: the capture's first camera, else the whole scene.

@@ -36,7 +36,7 @@ fn files_without_valid_splats_are_refused_in_one_message() {
         file.origin[1] = origin;
         let path = folder.join("checkpoint.npz");
         write_checkpoint(&path, &file);
-        refused(&mut command(&path, "--screenshot x.png"), &["checkpoint.npz", "origin"]);
+        refused(&mut command(&path, "--screenshot x.png"), &["checkpoint.npz", "frame"]);
     }
     refused(&mut command(&folder.join("no.ply"), ""), &["no.ply", "cannot be opened"]);
     refused(&mut command(&Folder::new().0, "--time 1"), &["holds no scene.ply"]);

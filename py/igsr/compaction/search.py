@@ -35,6 +35,7 @@ from igsr.compaction.validation import (
 )
 from igsr.errors import IgsrError
 from igsr.fitting.fitter import fit_device
+from igsr.geometry.frame import Frame
 from igsr.run import open_run
 from igsr.splats import MAX_SH_DEGREE, Splats
 
@@ -113,6 +114,9 @@ def compact(
     if splats.antialiased:
         raise IgsrError("Antialiased splats cannot be compacted: fits render without antialiasing.")
     name = _core.resolve_backend(backend)
+    frame = Frame.of_splats(splats)
+    splats = frame.splats(splats)
+    capture = capture and frame.capture(capture)
     # A backdrop would be pruned, since photos show little of it.
     bare = splats.without_backdrop()
     finite = subset(fresh_state(bare), np.flatnonzero(bare.finite))
@@ -125,11 +129,11 @@ def compact(
         validation = photo_validation(whole, capture, background, name)
     with open_run(None, progress) as run:
         search = _Search(
-            validation, whole.origin, max_loss, sh_degree, steps, seed, name, run.report
+            validation, frame, whole.origin, max_loss, sh_degree, steps, seed, name, run.report
         )
         best = search.run(whole)
     return Compaction(
-        splats_of(best.state, whole.origin).with_backdrop_of(splats),
+        frame.inverse.splats(splats_of(best.state, whole.origin).with_backdrop_of(splats)),
         {
             "max_loss": float(max_loss),
             "whole": search.curve[0],
@@ -161,6 +165,7 @@ class _Search:
     """The settings of a search, and its curve so far."""
 
     validation: Validation
+    frame: Frame
     origin: npt.NDArray[np.float64]
     max_loss: float
     sh_degree: int | None
@@ -284,7 +289,7 @@ class _Search:
         model = splats_of(state, self.origin)
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "scene.ply"
-            model.save(path)
+            self.frame.inverse.splats(model).save(path)
             size = path.stat().st_size
         row = {
             "splats": len(model),

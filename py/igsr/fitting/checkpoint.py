@@ -23,7 +23,7 @@ from igsr.errors import IgsrError
 from igsr.fitting.settings import FitSettings
 
 #: Incremented when the meaning of the arrays changes.
-FORMAT = 1
+FORMAT = 2
 #: Member with the settings, as UTF-8 JSON.
 SETTINGS = "settings"
 #: Recorded as the initialization of a fit that starts from splats.

@@ -22,6 +22,7 @@ from igsr.fitting.result import FitResult
 from igsr.fitting.train import Trained, train
 from igsr.fitting.transient_masks import any_masked, masked_fractions, masked_view, visible_splats
 from igsr.floaters import remove_floaters as without_floaters
+from igsr.geometry.frame import world_capture
 from igsr.rendering.backdrop import wants_backdrop, with_backdrop
 from igsr.splats import Splats, subset
 
@@ -55,11 +56,11 @@ def fit_capture(
     else:
         inputs = prepare(capture, start=start, **given)
     file = None if checkpoint is None else _checkpoint_file(inputs, checkpoint)
-    return finish(inputs, train(inputs, file, resume=resume, report=report))
+    return finish(inputs, train(inputs, file, resume=resume, report=report), capture)
 
 
-def finish(inputs: FitInputs, trained: Trained) -> FitResult:
-    """Remove floaters, add the backdrop and return the result of a fit."""
+def finish(inputs: FitInputs, trained: Trained, given: Capture) -> FitResult:
+    """Remove floaters, add the backdrop and return the result of a fit to ``given``."""
     settings, capture = inputs.settings, inputs.capture
     masks = iter(trained.masks)
     views = [
@@ -87,8 +88,11 @@ def finish(inputs: FitInputs, trained: Trained) -> FitResult:
         )
         splats, removed = cleaned.splats, cleaned.removed
     splats = first_splats(splats, len(splats) - inputs.frozen_count)
+    splats = inputs.frame.inverse.splats(splats)
+    capture = world_capture(inputs.frame, capture, inputs.given, given)
     wants = settings.backdrop and inputs.frozen is None
     if wants and wants_backdrop(trained.views, settings.background):
+        in_scene_colors = without_exposures(capture.train_views, trained.exposures)
         splats = with_backdrop(splats, photos_among(in_scene_colors), inputs.backend)
     return FitResult(
         splats,

@@ -18,6 +18,7 @@ from igsr.fitting.photo_statistics import PhotoStatistics, photo_statistics
 from igsr.fitting.pose_priors import PosePriors, pose_priors
 from igsr.fitting.presets import Quality, settings_for
 from igsr.fitting.settings import FitSettings
+from igsr.geometry.frame import Frame
 from igsr.splats import Splats
 
 
@@ -25,7 +26,11 @@ from igsr.splats import Splats
 class FitInputs:
     """Everything that a fit depends on.
 
+    Captures, splats and priors are in the frame of the fit.
+
     Attributes:
+        frame: of the fit.
+        given: the capture in the frame, as it was given.
         capture: its train views are fitted; given depths are scaled and checked.
         settings: of the fit.
         device: "backend" ("cpu" or "gpu"), "device" and "instruction_set".
@@ -35,6 +40,8 @@ class FitInputs:
         priors: pose priors of the train views; None if cameras are not optimized.
     """
 
+    frame: Frame
+    given: Capture
     capture: Capture
     settings: FitSettings
     device: dict[str, str]
@@ -101,6 +108,10 @@ def prepare(
     views = capture.train_views
     if not views:
         raise IgsrError(f"{capture.path} has no train views to fit.")
+    frame = Frame.of_capture(capture)
+    given_capture = capture = frame.capture(capture)
+    initial, frozen = (one and frame.splats(one) for one in (initial, frozen))
+    views = capture.train_views
     statistics = photo_statistics(photos_among(views))
     if initial is None:
         settings = settings_for(statistics, quality, **given)
@@ -121,7 +132,9 @@ def prepare(
         joint = settings.poses != "fixed"
         priors = pose_priors(views, capture.points, poses=joint, focal=settings.focal)
     exposures = starting_exposures(views, capture.points, settings.exposure)
-    return FitInputs(capture, settings, device, initial, frozen, exposures, priors)
+    return FitInputs(
+        frame, given_capture, capture, settings, device, initial, frozen, exposures, priors
+    )
 
 
 def _check_frozen(frozen: Splats, initial: Splats | None) -> None:

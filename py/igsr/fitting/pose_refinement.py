@@ -18,6 +18,7 @@ from igsr._internal.event import Event, Listener
 from igsr.capture import View
 from igsr.errors import IgsrError
 from igsr.fitting.fitter import fitted_cameras, fitter_of
+from igsr.geometry.frame import Frame
 from igsr.splats import PARAMETERS, Splats
 
 Float64 = npt.NDArray[np.float64]
@@ -63,6 +64,8 @@ def refine_cameras(
         )
     if not views:
         return []
+    frame = Frame.of_splats(splats)
+    splats, inside = frame.splats(splats), [frame.view(view) for view in views]
     total = steps * len(views)
     state = {name: getattr(splats, name) for name in PARAMETERS}
     settings = {
@@ -75,12 +78,15 @@ def refine_cameras(
         "camera_warm_up": 0.0,
     }
     try:
-        fitter = fitter_of(views, splats.origin, state, settings, _core.resolve_backend(backend))
+        fitter = fitter_of(inside, splats.origin, state, settings, _core.resolve_backend(backend))
         for done in range(len(views), total + 1, len(views)):
             fitter.step(len(views))
             if progress is not None:
                 progress(Event("refine cameras", done, total))
     except ValueError as error:
         raise IgsrError(f"{error}.") from error
-    cameras = fitted_cameras(views, fitter, splats.origin)
-    return [replace(view, camera=camera) for view, camera in zip(views, cameras, strict=True)]
+    cameras = fitted_cameras(inside, fitter, splats.origin)
+    return [
+        replace(view, camera=frame.inverse.camera(camera))
+        for view, camera in zip(views, cameras, strict=True)
+    ]

@@ -126,7 +126,10 @@ def train(
     if start is None:
         start = _new_start(inputs, report, started_at)
     settings, masks, looked_at = inputs.settings, start.masks, start.looked_at
-    kept: Arrays = {"origin": start.origin}
+    kept: Arrays = {
+        "origin": start.origin,
+        "frame": np.append(inputs.frame.origin, inputs.frame.unit),
+    }
     if settings.moves_cameras:
         kept[ROUGH_CAMERAS] = camera_rows(start.views)
 
@@ -231,6 +234,7 @@ def _resumed(inputs: FitInputs, file: CheckpointFile) -> _Start:
         IgsrError: the checkpoint cannot be used.
     """
     state, started, seconds = file.load()
+    state.pop("frame", None)
     origin = state.pop("origin", np.zeros(0))
     try:
         views = with_camera_rows(inputs.views, state.pop(ROUGH_CAMERAS, None))

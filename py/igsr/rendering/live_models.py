@@ -6,8 +6,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from igsr._internal.untrusted_npz import DAMAGE, stored_arrays
 from igsr.errors import IgsrError
+from igsr.geometry.frame import Frame
 from igsr.rendering.levels import INDEX, level_within
 from igsr.rendering.run_folder import CAMERAS, SCENE, VIEW, round_labels
 from igsr.splats import PARAMETERS, Splats
@@ -41,7 +44,9 @@ class LiveModel:
             return Splats.load(self.path)
         try:
             arrays: dict[str, Any] = stored_arrays(self.path)
-            return Splats(**{name: arrays[name] for name in (*PARAMETERS, "origin")})
+            splats = Splats(**{name: arrays[name] for name in (*PARAMETERS, "origin")})
+            *origin, unit = arrays["frame"]
+            return Frame(np.array(origin), float(unit)).inverse.splats(splats)
         except DAMAGE as error:
             raise IgsrError(f"The checkpoint {self.path} cannot be read ({error}).") from error
 

@@ -108,7 +108,7 @@ def project(splats: Splats, camera: Camera, backend: str) -> dict[str, npt.NDArr
         intrinsics=intrinsics_of(camera.K),
         width=camera.width,
         height=camera.height,
-        near=_core.NEAR_PLANE,
+        near=splats.extent[2],
         far=_core.FAR_PLANE,
         eps2d=_core.EPS2D,
         antialiased=splats.antialiased,

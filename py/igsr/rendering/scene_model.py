@@ -30,12 +30,8 @@ from igsr.splats import Splats
 MIN_LOG_SCALE = -10.0
 MAX_LOG_SCALE = 5.9375
 MIDDLE_LOG_SCALE = -2.0
-#: Splats of a lower opacity logit do not count for the extent, as in splat-view.
-FAINT_LOGIT = -2.2
 #: Splats at a larger distance are left out, or positions in 24 bits would be too coarse.
 MAX_DISTANCE_RADII = 1000
-#: Maximum number of splats to compute the extent from.
-EXTENT_SAMPLES = 100_000
 #: Models with more splats share rows of spherical harmonics.
 PALETTE_FROM = 100_000
 #: Maximum number of rows in a palette, for numbers of two bytes.
@@ -62,6 +58,7 @@ class EmbeddedModel:
         unit: factor of lengths.
         radius: times ``unit``; contains 90 % of the visible splats, but is at most four times the
             radius that contains 50 %.
+        near: near plane, times ``unit``.
         notes: messages about data that the format cannot hold.
     """
 
@@ -70,6 +67,7 @@ class EmbeddedModel:
     origin: npt.NDArray[np.float64]
     unit: float
     radius: float
+    near: float
     notes: list[str]
 
 
@@ -78,7 +76,7 @@ def embedded_model(splats: Splats) -> EmbeddedModel:
 
     Splats that are not finite, or farther than ``MAX_DISTANCE_RADII``, are left out.
     """
-    center, radius = _extent(splats.without_backdrop())
+    center, radius, near = splats.extent
     offsets = splats.means - center.astype(np.float32)
     kept = ~(np.abs(offsets).max(axis=1, initial=0.0) > MAX_DISTANCE_RADII * radius)
     unit = _unit(splats)
@@ -99,7 +97,7 @@ def embedded_model(splats: Splats) -> EmbeddedModel:
             f"{far} splats farther than {MAX_DISTANCE_RADII} radii of the scene are left out."
         )
     origin = splats.origin + center.astype(np.float32)
-    return EmbeddedModel(packed, count, origin, unit, radius * unit, notes)
+    return EmbeddedModel(packed, count, origin, unit, radius * unit, near * unit, notes)
 
 
 def _unit(splats: Splats) -> float:
@@ -111,19 +109,6 @@ def _unit(splats: Splats) -> float:
     if low >= MIN_LOG_SCALE and float(scales.max()) <= MAX_LOG_SCALE:
         return 1.0
     return float(2.0 ** np.round((MIDDLE_LOG_SCALE - 0.5 * (low + high)) / np.log(2.0)))
-
-
-def _extent(splats: Splats) -> tuple[npt.NDArray[np.float64], float]:
-    """Robust center [3], relative to the splats' origin, and radius, in world units."""
-    chosen = np.flatnonzero(splats.finite)
-    if len(chosen) == 0:
-        return np.zeros(3), 1.0
-    chosen = chosen[:: -(-len(chosen) // EXTENT_SAMPLES)]
-    clear = chosen[splats.opacities[chosen] > FAINT_LOGIT]
-    means = splats.means[clear if len(clear) else chosen].astype(np.float64)
-    center = np.asarray(np.median(means, axis=0))
-    half, most = np.quantile(np.linalg.norm(means - center, axis=1), [0.5, 0.9])
-    return center, float(min(most, 4.0 * half)) or 1.0
 
 
 def _packed(splats: Splats, radius: float) -> tuple[bytes, int, list[str]]:

@@ -45,8 +45,6 @@ SHADERS = {
     "presentVertex": "present.vert",
     "presentFragment": "present.frag",
 }
-#: Near plane of small scenes, in radii, as in splat-view.
-NEAR_RADII = 0.05
 #: Up axis of scenes without cameras, as in COLMAP's and INRIA's scenes.
 UP = (0.0, -1.0, 0.0)
 #: Maximum total number of splats of a page with several models.
@@ -157,7 +155,7 @@ def described_model(model: EmbeddedModel) -> dict[str, Any]:
         "origin": model.origin.tolist(),
         "unit": model.unit,
         "radius": model.radius,
-        "near": min(_core.NEAR_PLANE * model.unit, NEAR_RADII * model.radius),
+        "near": model.near,
     }
 
 

@@ -120,13 +120,19 @@ pub fn write_checkpoint(path: &Path, file: &SplatFile) {
     };
     let floats = |values: &[f32]| values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>();
     let (s, n) = (&file.splats, file.splats.len());
-    member("means", "<f4", &format!("{n}, 3"), floats(s.means.as_flattened()));
+    // A fit's frame has its own origin and unit.
+    let (at, unit) = ([1.0, -2.0, 0.5], 4.0f64);
+    let means: Vec<f32> = s.means.as_flattened().iter().map(|v| v / unit as f32).collect();
+    let scales: Vec<f32> = s.scales.as_flattened().iter().map(|v| v - unit.ln() as f32).collect();
+    member("means", "<f4", &format!("{n}, 3"), floats(&means));
     member("quats", "<f4", &format!("{n}, 4"), floats(s.quats.as_flattened()));
-    member("scales", "<f4", &format!("{n}, 3"), floats(s.scales.as_flattened()));
+    member("scales", "<f4", &format!("{n}, 3"), floats(&scales));
     member("opacities", "<f4", &format!("{n},"), floats(&s.opacities));
     member("sh", "<f4", &format!("{n}, {}, 3", s.stride()), floats(s.sh.as_flattened()));
-    let origin = file.origin.iter().flat_map(|v| v.to_le_bytes()).collect();
-    member("origin", "<f8", "3,", origin);
+    let doubles = |values: &[f64]| values.iter().flat_map(|v| v.to_le_bytes()).collect();
+    let origin: [f64; 3] = std::array::from_fn(|k| (file.origin[k] - at[k]) / unit);
+    member("origin", "<f8", "3,", doubles(&origin));
+    member("frame", "<f8", "4,", doubles(&[at[0], at[1], at[2], unit]));
     zip.finish().expect("zip");
 }
 

@@ -234,7 +234,9 @@ def _splats_at(xyz: Float64, colors: Float64, confidence: Float64 | None, sh_deg
     # Relative to the median, so that float32 is precise near the scene.
     origin = np.median(xyz, axis=0)
     arrays = _core.splats_from_points(
-        (xyz - origin).astype(np.float32), colors.astype(np.float32), sh_degree
+        np.ascontiguousarray(xyz - origin, np.float32),
+        np.ascontiguousarray(colors, np.float32),
+        sh_degree,
     )
     if confidence is not None:
         _apply_confidence(arrays, confidence)

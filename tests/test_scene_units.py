@@ -1,0 +1,139 @@
+"""The unit and the origin of the world change nothing in fits, scores and renders."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import rooms
+import scenes
+
+import igsr
+from igsr.blocks import BlockOptions, fit_in_blocks
+from igsr.capture import Points, View
+from igsr.fitting import fit_capture
+from igsr.geometry.frame import Frame
+from igsr.splats import joined
+from igsr_lab.large_scenes import towns
+
+SCALES = (1e-4, 1e-2, 100.0, 1e4)
+WORLDS = [(scale, 0.0) for scale in SCALES] + [(100.0, 5e5)]
+
+
+def world(scale, shift=0.0):
+    """The frame that makes worlds ``scale`` times as large and moves them by ``shift``."""
+    return Frame(np.full(3, -shift / scale), 1.0 / scale)
+
+
+def room():
+    cameras = [rooms.camera(angle, 60.0, 72, 54) for angle in np.linspace(-0.6, 0.6, 7)]
+    views = [
+        View(f"{i}.png", camera, "train" if i % 3 else "test", rooms.picture(camera))
+        for i, camera in enumerate(cameras)
+    ]
+    random = np.random.default_rng(0)
+    points, colors = [], []
+    for view in views:
+        if view.split == "train":
+            depth = rooms.depth(view.camera)
+            row, column = (random.integers(0, side, 80) for side in depth.shape)
+            pixel = np.stack([column + 0.5, row + 0.5, np.ones(80)])
+            ray = np.linalg.inv(view.camera.K) @ pixel * depth[row, column]
+            inverse = np.linalg.inv(view.camera.viewmat)
+            points.append((inverse[:3, :3] @ ray + inverse[:3, 3:]).T)
+            colors.append(view.image[row, column])
+    return igsr.Capture("room", views, Points(np.concatenate(points), np.concatenate(colors)))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"density": "original"},
+        {"density": "mcmc"},
+        {"density": "mcmc", "start": "rays"},
+        {"poses": "joint", "focal": "shared"},
+        {"exposure": "on"},
+    ],
+    ids=lambda options: "-".join(options.values()),
+)
+@pytest.mark.parametrize(("scale", "shift"), WORLDS)
+def test_fits(scale, shift, options):
+    options = {**options, "steps": 60, "max_splats": 600, "backend": "cpu"}
+    capture = room()
+    moved = world(scale, shift).capture(capture)
+    scores = []
+    for one in (capture, moved):
+        fitted = fit_capture(one, **options)
+        score = igsr.evaluate(fitted.splats, fitted.capture, "train")
+        scores.append((score.psnr, len(fitted.splats), *fitted.removed.values()))
+    # UTM coordinates are rounded, and a fit with other bits is another fit.
+    assert scores[1] == pytest.approx(scores[0], abs=0.3 if shift else 0.01)
+    assert scores[0][0] > 12.5
+
+
+@pytest.mark.parametrize("backend", ["cpu", "gpu"])
+@pytest.mark.parametrize(("scale", "shift"), [*WORLDS, (1.0, 5e5)])
+def test_renders(scale, shift, backend):
+    frame, splats = world(scale, shift), scenes.splats(count=200)
+    camera = scenes.ring_camera(0.4)
+    first, second = (
+        igsr.render(s, c, backend=backend).to_uint8().astype(int)
+        for s, c in ((splats, camera), (frame.splats(splats), frame.camera(camera)))
+    )
+    assert np.abs(first - second).max() <= 2
+    assert first.any()
+
+
+@pytest.mark.parametrize(("scale", "shift"), WORLDS)
+def test_cameras_are_refined(scale, shift):
+    frame, model = world(scale, shift), scenes.splats(count=60)
+    capture = scenes.capture(views=3, scene=model)
+    wrong = [
+        replace(view, split="test", camera=scenes.perturbed_camera(view.camera, 0.5, 0.02, 1))
+        for view in capture.views
+    ]
+    scores = []
+    for splats, views in (
+        (model, wrong),
+        (frame.splats(model), [frame.view(view) for view in wrong]),
+    ):
+        refined = igsr.refine_cameras(splats, views, (0.0, 0.0, 0.0), steps=40, backend="cpu")
+        refined = igsr.Capture(capture.path, refined)
+        scores.append(igsr.evaluate(splats, refined, "test", backend="cpu").psnr)
+    assert scores[1] == pytest.approx(scores[0], abs=0.1)
+    assert scores[0] > igsr.evaluate(model, igsr.Capture(capture.path, wrong), "test").psnr + 3.0
+
+
+@pytest.mark.parametrize(("scale", "shift"), WORLDS)
+def test_floaters_are_removed(scale, shift):
+    frame, model = world(scale, shift), scenes.splats(count=60, degree=0)
+    capture = scenes.capture(views=6, scene=model)
+    # In front of a camera, and far from all others.
+    front = capture.views[0].camera.center * 0.8
+    floaters = scenes.round_splats(np.array([front, [9.0, 9.0, 9.0]], np.float32), size=0.1)
+    dirty = joined([model, floaters])
+    removed = [
+        igsr.remove_floaters(splats, one, backend="cpu").removed
+        for splats, one in ((dirty, capture), (frame.splats(dirty), frame.capture(capture)))
+    ]
+    assert removed[0] == removed[1]
+    assert sum(removed[0].values()) > 0
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1e4])
+def test_blocks(scale, tmp_path):
+    town = towns.town(1, 1, 16, 48, 36, points=200, sharp=1)
+    scores = []
+    for name, one in (("one", town), ("other", world(scale).capture(town))):
+        folder = tmp_path / name
+        scenes.write_capture(folder, one)
+        options = BlockOptions(blocks=2, settings={"steps": 30, "max_splats": 600})
+        splats, _ = fit_in_blocks(folder, tmp_path / f"{name}-out", options)
+        scores.append(igsr.evaluate(splats, one, "train").psnr)
+    assert scores[1] == pytest.approx(scores[0], abs=0.1)
+
+
+def test_rasterization_keeps_the_near_plane_of_gsplat():
+    scene = scenes.torch_scene()
+    near = scenes.rasterized(scene)[0]
+    assert near.equal(scenes.rasterized(scene, near_plane=0.01)[0])
+    assert not near.equal(scenes.rasterized(scene, near_plane=4.0)[0])
