@@ -154,7 +154,7 @@ def test_poses_in_a_rig_are_products(tmp_path):
 @pytest.mark.parametrize("model", ["FOV", "RAD_TAN_THIN_PRISM_FISHEYE", "EUCM"])
 def test_unsupported_models_are_named(model, text, tmp_path):
     write_colmap(tmp_path, model, text=text)
-    with pytest.raises(IgsrError, match=f"camera 7 has the model {model}, which is not supported"):
+    with pytest.raises(IgsrError, match=f"camera 7: the model {model} is not supported"):
         load_capture(tmp_path)
 
 

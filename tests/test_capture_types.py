@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,10 +23,11 @@ def changed(matrix, row, column, value):
 
 
 def capture(names, centers=None):
-    views, image = [], np.zeros((2, 3, 3), dtype=np.uint8)
+    views = []
     for index, name in enumerate(names):
         viewmat = np.eye(4)
         viewmat[:3, 3] = 0.0 if centers is None else -centers[index]
+        image = np.full((2, 3, 3), index, dtype=np.uint8)
         views.append(View(name, Camera(viewmat, K, 3, 2), "train", image))
     return Capture(Path("capture"), views)
 
@@ -117,6 +119,16 @@ def test_holdout_is_by_name_and_keeps_the_order():
         assert_refused("holdout is", whole.with_holdout, every)
     with pytest.raises(IgsrError, match="one photo only"):
         capture(["a"]).with_holdout(8)
+
+
+def test_copies_of_a_photo_are_held_out_together():
+    whole = capture([f"{index}.png" for index in range(6)])
+    views = [
+        replace(view, image=whole.views[0].image) if view.name == "5.png" else view
+        for view in whole.views
+    ]
+    split = Capture(whole.path, views).with_holdout(4)
+    assert [view.name for view in split.test_views] == ["0.png", "4.png", "5.png"]
 
 
 def test_extent_of_the_training_cameras():

@@ -21,7 +21,7 @@ import numpy as np
 
 from igsr.errors import IgsrError
 
-# Parameters of COLMAP's camera models, in the order of their numbers; None if unsupported.
+# Parameters of COLMAP's camera models, in the order of their numbers.
 _PARAMETER_COUNTS = {
     "SIMPLE_PINHOLE": 3,
     "PINHOLE": 4,
@@ -30,18 +30,21 @@ _PARAMETER_COUNTS = {
     "OPENCV": 8,
     "OPENCV_FISHEYE": 8,
     "FULL_OPENCV": 12,
-    "FOV": None,
+    "FOV": 5,
     "SIMPLE_RADIAL_FISHEYE": 4,
     "RADIAL_FISHEYE": 5,
     "THIN_PRISM_FISHEYE": 12,
-    "RAD_TAN_THIN_PRISM_FISHEYE": None,
-    "SIMPLE_DIVISION": None,
-    "DIVISION": None,
+    "RAD_TAN_THIN_PRISM_FISHEYE": 16,
+    "SIMPLE_DIVISION": 4,
+    "DIVISION": 5,
     "SIMPLE_FISHEYE": 3,
     "FISHEYE": 4,
-    "EUCM": None,
+    "EUCM": 6,
     "EQUIRECTANGULAR": 2,
 }
+
+# Models whose lenses igsr cannot undo. Cameras that no photo has may have any model.
+_UNSUPPORTED = {"FOV", "RAD_TAN_THIN_PRISM_FISHEYE", "SIMPLE_DIVISION", "DIVISION", "EUCM"}
 
 #: COLMAP's number of the sensor type "camera".
 CAMERA_SENSOR = 0
@@ -116,14 +119,17 @@ def read_frames(path: Path) -> list[list[int]]:
         ) from error
 
 
-def _checked_parameter_count(path: Path, camera_id: int, model: str) -> int:
-    count = _PARAMETER_COUNTS.get(model)
-    if count is None:
+def check_supported(model: str) -> None:
+    """Check a camera's model.
+
+    Raises:
+        IgsrError: igsr cannot undo the distortion of its lenses.
+    """
+    if model in _UNSUPPORTED or model not in _PARAMETER_COUNTS:
         raise IgsrError(
-            f"{path}: camera {camera_id} has the model {model}, which is not supported; undistort "
-            "the photos with COLMAP's image_undistorter or use an OPENCV model"
+            f"the model {model} is not supported; undistort the photos with COLMAP's "
+            "image_undistorter or use an OPENCV model"
         )
-    return count
 
 
 def _read(path: Path) -> bytes:
@@ -135,7 +141,7 @@ def _read(path: Path) -> bytes:
 
 def _utf8(path: Path, data: bytes) -> str:
     try:
-        return data.decode()
+        return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise IgsrError(f"{path} is corrupt or not in UTF-8; export the model again") from error
 
@@ -197,9 +203,13 @@ def _binary_cameras(path: Path) -> dict[int, ColmapCamera]:
     models = dict(enumerate(_PARAMETER_COUNTS))
     for _ in file.entries():
         camera_id, number, width, height = file.unpack(CAMERA)
-        model = models.get(number, f"number {number}")
-        count = _checked_parameter_count(path, camera_id, model)
-        params = file.unpack(struct.Struct(f"<{count}d"))
+        model = models.get(number)
+        if model is None:
+            raise IgsrError(
+                f"{path}: camera {camera_id} has the model number {number}, which is not "
+                "supported; export the model as text"
+            )
+        params = file.unpack(struct.Struct(f"<{_PARAMETER_COUNTS[model]}d"))
         cameras[camera_id] = ColmapCamera(model, width, height, params)
     return cameras
 
@@ -261,7 +271,7 @@ def _text_cameras(path: Path) -> dict[int, ColmapCamera]:
             identity, model, width, height, *params = line.split()
             camera = ColmapCamera(model, int(width), int(height), tuple(map(float, params)))
             camera_id = int(identity)
-        count = _checked_parameter_count(path, camera_id, model)
+        count = _PARAMETER_COUNTS.get(model, len(params))
         if len(params) != count:
             raise IgsrError(
                 f"{path}, line {number}: {model} has {count} parameters, not {len(params)}; "

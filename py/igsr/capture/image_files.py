@@ -17,10 +17,9 @@ from igsr.errors import IgsrError
 
 Numbers = npt.NDArray[Any]
 
-_HEIF_SUFFIXES = (".heic", ".heif")
 SUFFIXES = (
-    *(".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".ppm", ".gif"),
-    *_HEIF_SUFFIXES,
+    *(".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".mpo", ".webp", ".tif", ".tiff"),
+    *(".bmp", ".ppm", ".gif", ".heic", ".heif", ".avif"),
 )
 
 # Pillow reads more formats, but runs another program for some of them (EPS).
@@ -54,16 +53,9 @@ def open_image(path: Path) -> Image.Image:
         IgsrError: the file is missing, has an unsupported format, or claims more pixels than its
             bytes can hold.
     """
-    formats: tuple[str, ...] = _FORMATS
-    if path.suffix.lower() in _HEIF_SUFFIXES:
-        # Imported here because it loads an HEVC decoder, which few captures need.
-        import pillow_heif
-
-        pillow_heif.register_heif_opener()
-        formats = ("HEIF",)
     try:
         file_size = path.stat().st_size
-        image = Image.open(path, formats=formats)
+        image = Image.open(path, formats=_formats(path))
     except FileNotFoundError as error:
         raise IgsrError(f"{path} does not exist; put the image there") from error
     except Image.DecompressionBombError as error:
@@ -79,6 +71,21 @@ def open_image(path: Path) -> Image.Image:
             "save it again"
         )
     return image
+
+
+def _formats(path: Path) -> tuple[str, ...]:
+    """The formats that a file may have by its first bytes; phones name JPEGs .heic."""
+    with open(path, "rb") as file:
+        head = file.read(12)
+    if head[4:8] != b"ftyp":
+        return _FORMATS
+    if head[8:12] in (b"avif", b"avis"):
+        return ("AVIF",)
+    # Imported here because it loads an HEVC decoder, which few captures need.
+    import pillow_heif
+
+    pillow_heif.register_heif_opener()
+    return ("HEIF",)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,8 @@ from pathlib import Path
 from igsr.capture.downscaling import check_max_size
 from igsr.capture.image_files import SUFFIXES, is_file
 from igsr.capture.memory_check import PhotoSizes
-from igsr.capture.photo_folder import FRAMES, has_photos, pixel_sizes
+from igsr.capture.photo_files import find_photo_files, has_photos
+from igsr.capture.photo_folder import FRAMES, pixel_sizes
 from igsr.capture.photos import DescribedCapture, checked_headers, shot_sizes
 from igsr.capture.read_colmap import describe_colmap, find_model, reduction_of
 from igsr.capture.read_transforms import describe_split_transforms, describe_transforms
@@ -128,11 +129,15 @@ class Overview(PhotoSizes):
         path: of the capture, folder or video.
         has_cameras: whether it is a capture, whose cameras are known.
         train: number of the photos that are for training; all of them without cameras.
+        masks: number of photos with a mask.
+        left_out: what else is there, and is not a photo of the scene.
     """
 
     path: Path
     has_cameras: bool
     train: int
+    masks: int = 0
+    left_out: str = ""
 
     def train_photos(self, holdout: int | None) -> int:
         """Return the maximum number of photos to fit if every ``holdout``-th is held out."""
@@ -162,6 +167,14 @@ def look_at(
         shots = describe_capture(path, max_size).shots
         sizes = shot_sizes(shots, checked_headers(shots))
         train = sum(shot.split == "train" for shot in shots)
-        return Overview(path=path, has_cameras=True, train=train, **vars(sizes))
-    sizes = pixel_sizes(path, frames)
-    return Overview(path=path, has_cameras=False, train=len(sizes.sizes), **vars(sizes))
+        masks = sum(shot.mask_path is not None for shot in shots)
+        return Overview(path=path, has_cameras=True, train=train, masks=masks, **vars(sizes))
+    sizes, found = pixel_sizes(path, frames), find_photo_files(path)
+    return Overview(
+        path=path,
+        has_cameras=False,
+        train=len(sizes.sizes),
+        masks=found.mask_count(),
+        left_out=found.left_out_words(),
+        **vars(sizes),
+    )

@@ -7,20 +7,15 @@ with the fields that it would have in a ``transforms.json``.
 These photos are turned by their EXIF orientation. Those of a capture are not: its cameras refer to
 the pixels as stored.
 
-Masks are in a folder ``masks`` in the folder of photos or, if that is named ``images``, next to it:
-``masks/NAME.png`` with the photo's whole name, as in COLMAP (``masks/a/1.jpg.png``), or with
-``.png`` in place of its suffix (``masks/a/1.png``). White pixels may be used, black ones may not. A
-mask has the size of the upright photo.
+The masks of photos (see ``igsr.capture.mask_files``) have the size of the upright photo.
 """
 
 from __future__ import annotations
 
-import os
 import warnings
-from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 
@@ -28,16 +23,16 @@ from igsr._internal.name_lists import listed
 from igsr._internal.user_warning import warn_user
 from igsr.capture.downscaling import area_means, check_max_size, reduced_size
 from igsr.capture.exif import TURNED, Exif, read_exif, turned_back, upright
-from igsr.capture.image_files import SUFFIXES, decoded, is_file, mask_of, open_image, photo_header
+from igsr.capture.image_files import decoded, is_file, mask_of, open_image, photo_header
+from igsr.capture.mask_files import MaskFiles
 from igsr.capture.memory_check import PhotoSizes
+from igsr.capture.photo_files import Paths, find_photo_files
 from igsr.capture.read_transforms import read_lens
 from igsr.capture.rig import Rig, decoded_size, rig_of, sampled_views
 from igsr.capture.types import Camera
 from igsr.capture.video_frames import VIDEO_SUFFIXES, sharpest_frames, video_size
 from igsr.capture.wide_photos import WideFisheye, WidePhoto, panorama_of
 from igsr.errors import IgsrError
-
-Paths = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 
 #: Default maximum number of frames taken from each video.
 FRAMES = 100
@@ -99,8 +94,8 @@ def read_photos(path: Paths, frames: int = FRAMES, max_size: int | None = None) 
 
     Args:
         path: a folder, a video, or a list of photos and videos. Subfolders are read too, and files
-            that are not photos are ignored. If a folder has no photos itself but ``images/``, those
-            photos are loaded.
+            that are not photos are ignored (see ``igsr.capture.photo_files``). If most photos are
+            in ``images/``, only those are loaded.
         frames: maximum number of frames taken from each video; fewer if the camera moves little
             (see ``igsr.capture.video_frames``).
         max_size: longest side, in pixels, of photos as loaded. Larger ones are reduced with an area
@@ -119,7 +114,8 @@ def read_photos(path: Paths, frames: int = FRAMES, max_size: int | None = None) 
             f"frames is {frames!r}; give a whole number of at least 1, such as {FRAMES}"
         )
     check_max_size(max_size)
-    root, files, masks = _find_files(path)
+    found = find_photo_files(path)
+    root, files = found.root, found.files
     lens = _read_lens(root)
 
     def load(file: Path) -> list[Photo] | IgsrError:
@@ -127,18 +123,19 @@ def read_photos(path: Paths, frames: int = FRAMES, max_size: int | None = None) 
         try:
             if file.suffix.lower() in VIDEO_SUFFIXES:
                 return _photos_of_video(file, name, frames, max_size)
-            return _photos_of_file(file, name, masks, lens, max_size)
+            return _photos_of_file(file, name, found.masks, lens, max_size)
         except IgsrError as error:
             return error
 
     with warnings.catch_warnings():
         # Pillow warns of damaged EXIF and the like even if the pixels can be read.
         warnings.filterwarnings("ignore", module="PIL")
-        sizes = replace(_sizes_of(files, frames, lens), masked=masks.is_dir())
+        sizes = replace(_sizes_of(files, frames, lens), masked=bool(found.masks))
         sizes.check_memory(max_size)
         with ThreadPoolExecutor(max_workers=sizes.decoding_threads(max_size)) as pool:
             results = list(pool.map(load, files))
     photos = [photo for result in results if isinstance(result, list) for photo in result]
+    found.masks.warn_unless_used(found.mask_count())
     errors = [result for result in results if isinstance(result, IgsrError)]
     if errors:
         if len(photos) < MIN_PHOTOS:
@@ -154,87 +151,14 @@ def read_photos(path: Paths, frames: int = FRAMES, max_size: int | None = None) 
     return photos
 
 
-def has_photos(path: Path) -> bool:
-    """Return whether a path is a video, or a folder that holds photos or videos."""
-    if is_file(path):
-        return path.suffix.lower() in VIDEO_SUFFIXES
-    try:
-        return path.is_dir() and next(_walk(_photo_root(path)), None) is not None
-    except (OSError, ValueError):
-        return False
-
-
 def file_sizes(path: Path) -> dict[str, int]:
     """Return the size in bytes of each photo and video that ``read_photos`` would load, by name.
 
     A ``lens.json`` counts too, since cameras depend on it.
     """
-    root, files, _ = _find_files(path)
-    files = [*files, *filter(is_file, [root / LENS])]
-    return {file.relative_to(root).as_posix(): file.stat().st_size for file in files}
-
-
-def _photo_root(folder: Path) -> Path:
-    """``images`` if only that has photos, else the folder itself."""
-    inner = folder / "images"
-    if inner.is_dir() and not any(_is_photo(entry) for entry in folder.iterdir()):
-        return inner
-    return folder
-
-
-def _is_photo(path: Path) -> bool:
-    suffixes = SUFFIXES + VIDEO_SUFFIXES
-    return path.suffix.lower() in suffixes and not path.name.startswith(".") and is_file(path)
-
-
-def _walk(root: Path) -> Iterator[Path]:
-    """The photos and videos in a folder, without hidden folders and the masks."""
-    for place, folders, names in os.walk(root):
-        visible = [name for name in folders if not name.startswith(".")]
-        folders[:] = [name for name in visible if Path(place) != root or name != "masks"]
-        yield from (file for name in names if _is_photo(file := Path(place, name)))
-
-
-def _find_files(path: Paths) -> tuple[Path, list[Path], Path]:
-    """The root of the names, the photos and videos, and the folder of masks."""
-    if not isinstance(path, (str, os.PathLike)):
-        return _listed_files([Path(file) for file in path])
-    folder = Path(path)
-    if is_file(folder):
-        return _listed_files([folder])
-    try:
-        if not folder.is_dir():
-            raise IgsrError(f"{folder} does not exist or is no folder; give a folder of photos")
-        root = _photo_root(folder)
-        files = sorted(_walk(root), key=lambda file: file.relative_to(root).as_posix())
-    except IgsrError:  # a ValueError, too
-        raise
-    except (OSError, ValueError) as error:
-        raise IgsrError(f"{folder} cannot be read; give a folder of photos") from error
-    if not files:
-        raise IgsrError(
-            f"{folder} holds no photos; give a folder with JPEG, PNG, WebP or HEIC files"
-        )
-    masks = root / "masks"
-    if not masks.is_dir() and root.resolve().name == "images":
-        masks = root.resolve().parent / "masks"
-    return root, files, masks
-
-
-def _listed_files(files: list[Path]) -> tuple[Path, list[Path], Path]:
-    if not files:
-        raise IgsrError("photos is an empty list; give at least two photos")
-    for file in files:
-        if not is_file(file):
-            raise IgsrError(f"{file} does not exist or is no file; give photos or one folder")
-        if file.suffix.lower() not in SUFFIXES + VIDEO_SUFFIXES:
-            raise IgsrError(f"{file} is no photo by its name; give JPEG, PNG, WebP or HEIC files")
-    files = [file.absolute() for file in files]
-    repeated = [file for index, file in enumerate(files) if file in files[:index]]
-    if repeated:
-        raise IgsrError(f"{repeated[0]} is given twice; give it once")
-    root = Path(os.path.commonpath([file.parent for file in files]))
-    return root, files, root / "masks"
+    found = find_photo_files(path)
+    files = [*found.files, *filter(is_file, [found.root / LENS])]
+    return {file.relative_to(found.root).as_posix(): file.stat().st_size for file in files}
 
 
 def pixel_sizes(path: Paths, frames: int = FRAMES) -> PhotoSizes:
@@ -243,8 +167,8 @@ def pixel_sizes(path: Paths, frames: int = FRAMES) -> PhotoSizes:
     Pixels are decoded only of photos that may be panoramas. The photos count as masked, since it is
     unknown whether their lenses distort.
     """
-    root, files, _ = _find_files(path)
-    return replace(_sizes_of(files, frames, _read_lens(root)), masked=True)
+    found = find_photo_files(path)
+    return replace(_sizes_of(found.files, frames, _read_lens(found.root)), masked=True)
 
 
 def _sizes_of(files: list[Path], frames: int, lens: WideFisheye | None) -> PhotoSizes:
@@ -288,11 +212,10 @@ def _wide_photo(file: Path, size: tuple[int, int], lens: WideFisheye | None) -> 
 
 
 def _photos_of_file(
-    file: Path, name: str, masks: Path, lens: WideFisheye | None, max_size: int | None
+    file: Path, name: str, masks: MaskFiles, lens: WideFisheye | None, max_size: int | None
 ) -> list[Photo]:
     """A photo, or the views of a wide one."""
-    mask_paths = (masks / f"{name}.png", masks / PurePosixPath(name).with_suffix(".png"))
-    mask_path = next(filter(is_file, mask_paths), None)
+    mask_path = masks.of(name)
     with open_image(file) as image:
         full, exif = image.size, read_exif(image)
         mask = None

@@ -30,6 +30,7 @@ from igsr._internal.rotations import rotations_of
 from igsr.capture import colmap_files
 from igsr.capture.colmap_files import ColmapCamera, ColmapImage
 from igsr.capture.image_files import DEPTHS, SUFFIXES, find_depth, is_file
+from igsr.capture.mask_files import MaskFiles
 from igsr.capture.photos import DescribedCapture, Shot, rig_shots
 from igsr.capture.rig import Rig, moved_to_side, rig_of
 from igsr.capture.types import Camera, Points, Tracks, intrinsic_matrix
@@ -64,8 +65,8 @@ def describe_colmap(
 
     Args:
         path: the capture. Its photos are in ``images/``, or reduced in ``images_K/`` or, without
-            any of these, in the capture itself. The mask of a photo, if any, is ``masks/``, its
-            whole name and ``.png``; its depth, if any, is in ``depths/`` (see ``find_depth``).
+            any of these, in the capture itself. They may have masks (see
+            ``igsr.capture.mask_files``), and depths in ``depths/`` (see ``find_depth``).
         model: the folder with cameras, images and points3D, all ``.bin`` or all ``.txt``.
         max_size: longest side in pixels of photos as they will be loaded, or None.
         folder: name of the folder of photos to use, or None for the smallest that is large enough.
@@ -82,7 +83,10 @@ def describe_colmap(
             f"{images_path} is missing next to {cameras_path.name}; copy the whole model"
         )
     cameras = colmap_files.read_cameras(cameras_path)
-    images = sorted(colmap_files.read_images(images_path), key=lambda image: image.name)
+    images = colmap_files.read_images(images_path)
+    # Models made on Windows have backslashes in names.
+    images = [replace(image, name=image.name.replace("\\", "/")) for image in images]
+    images.sort(key=lambda image: image.name)
     if not images:
         raise IgsrError(f"{images_path} lists no images; give a model with registered images")
     for image in images:
@@ -103,11 +107,11 @@ def describe_colmap(
         except IgsrError as error:
             raise IgsrError(f"{cameras_path}, camera {image.camera_id}: {error}") from error
         name = posixpath.normpath(posixpath.join(prefix, image.name))
-        mask = files.masks / f"{image.name}.png"
-        mask_path = mask if is_file(mask) else None
-        shot = Shot(name, file, camera, lens, "train", mask_path, images_path, files.factor)
+        mask = files.masks.of(image.name)
+        shot = Shot(name, file, camera, lens, "train", mask, images_path, files.factor)
         shot = replace(shot, depth_path=find_depth(path / DEPTHS, image.name))
         photos.append(_Photo(image, shot, rig))
+    files.masks.warn_unless_used(sum(photo.shot.mask_path is not None for photo in photos))
     frames = colmap_files.read_frames(frames_path) if is_file(frames_path) else []
     shared = _shared_centers(frames, [photo for photo in photos if photo.rig is None])
     shots = []
@@ -136,6 +140,7 @@ class _Photo:
 
 
 def _camera(colmap: ColmapCamera, viewmat: np.ndarray) -> tuple[Camera, Lens, Rig | None]:
+    colmap_files.check_supported(colmap.model)
     K, lens = intrinsics(colmap)
     camera = Camera(viewmat, K, colmap.width, colmap.height)
     wide: WidePhoto | None = wide_fisheye(K, lens, colmap.width, colmap.height)
@@ -256,11 +261,11 @@ def _tracks(path: Path, photos: list[_Photo], ids: np.ndarray, xyz: np.ndarray) 
 
 @dataclass(frozen=True)
 class _PhotoFiles:
-    """The photos of a model in its order, reduced by a factor; ``masks`` need not exist."""
+    """The photos of a model in its order, reduced by a factor, and the masks of all photos."""
 
     files: list[Path]
     factor: int
-    masks: Path
+    masks: MaskFiles
 
 
 def _find_photos(
@@ -297,9 +302,7 @@ def _find_photos(
     for factor in factors:
         files = _photos_in(folders[factor], full, names, same_names=factor == 1)
         if files is not None:
-            own_masks = capture / f"masks_{factor}"
-            has_own = factor > 1 and own_masks.is_dir()
-            return _PhotoFiles(files, factor, own_masks if has_own else capture / "masks")
+            return _PhotoFiles(files, factor, MaskFiles.beside(folders[factor], factor, capture))
     required = folders[min(folders)]
     missing = next(name for name in names if not is_file(required / name))
     raise IgsrError(

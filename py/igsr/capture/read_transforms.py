@@ -23,6 +23,7 @@ import numpy as np
 
 from igsr._internal.choices import SPLITS, Split
 from igsr.capture.image_files import is_file, photo_header
+from igsr.capture.mask_files import MaskFiles
 from igsr.capture.photos import DescribedCapture, Shot, rig_shots
 from igsr.capture.point_cloud import read_point_cloud
 from igsr.capture.rig import rig_of
@@ -55,9 +56,25 @@ def describe_transforms(path: Path) -> DescribedCapture:
     def points() -> Points | None:
         if "ply_file_path" not in document:
             return None
-        return read_point_cloud(path.parent / _text(document, "ply_file_path", str(path)))
+        return read_point_cloud(path.parent / _file_text(document, "ply_file_path", str(path)))
 
-    return DescribedCapture(path.parent, shots, points)
+    return DescribedCapture(path.parent, _with_masks(shots, path.parent), points)
+
+
+def _with_masks(shots: list[Shot], folder: Path) -> list[Shot]:
+    """The photos with masks by their names, if the file names no mask."""
+    tops = {shot.name.split("/")[0] for shot in shots if "/" in shot.name}
+    if len(tops) != 1 or any(shot.mask_path is not None for shot in shots):
+        return shots
+    photos = folder / tops.pop()
+    masks = MaskFiles.beside(photos, capture=folder)
+    found = []
+    for shot in shots:
+        is_inside = shot.rig is None and shot.path.is_relative_to(photos)
+        mask = masks.of(shot.path.relative_to(photos).as_posix()) if is_inside else None
+        found.append(shot if mask is None else replace(shot, mask_path=mask))
+    masks.warn_unless_used(sum(shot.mask_path is not None for shot in found))
+    return found
 
 
 def describe_split_transforms(folder: Path) -> DescribedCapture:
@@ -79,7 +96,7 @@ def read_cameras(path: Path) -> list[tuple[str, Camera]]:
         raise IgsrError(f"{path}: camera_model must be PINHOLE, as igsr writes it")
     cameras = []
     for index, frame in enumerate(_frames(document, path)):
-        name = _text(frame, "file_path", f"{path}, frame {index}")
+        name = _file_text(frame, "file_path", f"{path}, frame {index}")
         where = f"{path}, frame {index} ({name})"
         width, height = _size(frame, where)
         K, _ = _intrinsics(frame, width, height, where)
@@ -172,7 +189,12 @@ def _is_number(value: Any) -> bool:
 
 def _frame_name(frame: dict[str, Any], path: Path, index: int) -> str:
     """``file_path``, normalized: "./a.png" and "a.png" are the same frame."""
-    return posixpath.normpath(_text(frame, "file_path", f"{path}, frame {index}"))
+    return posixpath.normpath(_file_text(frame, "file_path", f"{path}, frame {index}"))
+
+
+def _file_text(fields: dict[str, Any], key: str, where: str) -> str:
+    """The path of a file; files made on Windows have backslashes."""
+    return _text(fields, key, where).replace("\\", "/")
 
 
 def _shots(
@@ -227,7 +249,7 @@ def _crop_radius(fields: dict[str, Any], where: str) -> float:
 def _named_file(fields: dict[str, Any], key: str, kind: str, path: Path, where: str) -> Path | None:
     if key not in fields:
         return None
-    file = path.parent / _text(fields, key, where)
+    file = path.parent / _file_text(fields, key, where)
     if not is_file(file):
         raise IgsrError(f"{where}: the {kind} {file} is missing; put it there")
     return file

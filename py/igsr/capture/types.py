@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -366,8 +367,9 @@ class Capture(ArrayEquality, NotebookPicture):
     def with_holdout(self, every: int) -> Capture:
         """Hold out every Nth photo for testing.
 
-        The views of one rig count as one photo. If a photo is blurred and its neighbors are sharp,
-        the next sharp one is held out instead: a blurred photo gives a good fit a bad score.
+        The views of one rig, and photos with the same pixels, count as one photo. If a photo is
+        blurred and its neighbors are sharp, the next sharp one is held out instead: a blurred photo
+        gives a good fit a bad score.
 
         Args:
             every: photos, sorted by name, whose index is a multiple of ``every`` become "test", all
@@ -379,17 +381,28 @@ class Capture(ArrayEquality, NotebookPicture):
         Raises:
             IgsrError: ``every`` is not a whole number of at least 2, or there is only one photo.
         """
-        photos = sorted({view.photo for view in self.views})
+        copied = self._copies()
+        photos = sorted({copied[view.photo] for view in self.views})
         check_holdout(every, len(photos), self.path)
-        blurred = blurred_photos((view.photo, view.image, view.mask) for view in self.views)
+        blurred = blurred_photos((copied[v.photo], v.image, v.mask) for v in self.views)
         spans = (photos[first : first + every] for first in range(0, len(photos), every))
         sharp_spans = ([name for name in span if name not in blurred] for span in spans)
         held_out = {span[0] for span in sharp_spans if span}
         views = [
-            replace(view, split="test" if view.photo in held_out else "train")
+            replace(view, split="test" if copied[view.photo] in held_out else "train")
             for view in self.views
         ]
         return Capture(self.path, views, self.points)
+
+    def _copies(self) -> dict[str, str]:
+        """For each photo, the first one with the same pixels."""
+        first: dict[bytes, str] = {}
+        copied: dict[str, str] = {}
+        for view in sorted(self.views, key=lambda view: view.name):
+            digest = hashlib.sha256(str(view.image.shape).encode())
+            digest.update(np.ascontiguousarray(view.image).tobytes())
+            copied.setdefault(view.photo, first.setdefault(digest.digest(), view.photo))
+        return copied
 
     def _camera_centers(self) -> np.ndarray:
         return np.stack([view.camera.center for view in self.train_views or self.views])

@@ -11,6 +11,7 @@ from igsr._internal.atomic_write import atomic_write
 from igsr._internal.choices import Backend
 from igsr.capture import Camera, View, load_capture
 from igsr.capture.downscaling import reduced_size, resized_camera
+from igsr.capture.photo_files import OWN_TAG
 from igsr.cli.error_messages import error_messages
 from igsr.cli.options import (
     NAMED_COLORS,
@@ -132,6 +133,7 @@ def _write_pictures(
     exr: bool,
 ) -> list[Path]:
     from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
 
     suffix = ".exr" if exr else ".png"
     files: list[Path] = []
@@ -146,6 +148,8 @@ def _write_pictures(
                     str(temporary), picture.color, picture.alpha, picture.expected_depth
                 )
             else:
-                Image.fromarray(picture.to_uint8()).save(temporary, format="PNG")
+                tag = PngInfo()
+                tag.add_text("Software", OWN_TAG)
+                Image.fromarray(picture.to_uint8()).save(temporary, format="PNG", pnginfo=tag)
         files.append(path)
     return files

@@ -62,8 +62,10 @@ def announcement(
     cameras = 0.0 if cameras_known else camera_seconds(seen.sizes)
     return [
         f"Found {len(seen.sizes)} photos of {_size_range(seen.sizes)}"
+        + (f", {seen.masks} of them with masks" if seen.masks else "")
         + (f", {held_out} of them held out" if held_out else "")
-        + ("." if seen.has_cameras else ", without cameras."),
+        + ("" if seen.has_cameras else ", without cameras")
+        + (f"; left out: {seen.left_out}." if seen.left_out else "."),
         ("Fits " if cameras_known else "Finds the cameras, then fits ")
         + f"at {width}x{height}: up to {settings.max_splats} splats, {settings.steps} steps.",
         f"Takes {'at most ' if rounds else ''}about {_duration(cameras + fit)} here"

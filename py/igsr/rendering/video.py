@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from igsr._internal.atomic_write import atomic_write
+from igsr.capture.photo_files import OWN_TAG
 from igsr.errors import IgsrError
 
 
@@ -28,6 +29,7 @@ def write_video(path: Path, frames: Iterable[npt.NDArray[np.uint8]], fps: int = 
         codec = "mpeg4"
     try:
         with atomic_write(path) as temporary, av.open(str(temporary), mode="w") as container:
+            container.metadata["comment"] = OWN_TAG
             stream: av.VideoStream | None = None
             for frame in frames:
                 height, width = (size - size % 2 for size in frame.shape[:2])

@@ -1,0 +1,264 @@
+"""Which files of a folder are photos of the scene, which are masks, and what is left out."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import scenes
+from PIL import Image
+
+import igsr
+from igsr.capture.load import look_at
+from igsr.capture.mask_files import MASK_FOLDERS
+from igsr.capture.photo_files import find_photo_files, has_photos
+from igsr.capture.photo_folder import read_photos
+from igsr.errors import IgsrError
+
+MASK = np.zeros((24, 32), np.uint8)
+MASK[:, :20] = 255
+
+
+def photo(path, seed=0, size=(24, 32)):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pixels = np.random.default_rng(seed).integers(0, 255, (*size, 3), dtype=np.uint8)
+    Image.fromarray(pixels).save(path, format="PNG")
+
+
+def photos(folder, count=3, suffix=".png"):
+    for index in range(count):
+        photo(folder / f"{index}{suffix}", index)
+    return folder
+
+
+def found(folder):
+    files = find_photo_files(folder)
+    return [file.relative_to(files.root).as_posix() for file in files.files], files.left_out_words()
+
+
+@pytest.mark.parametrize("folder", [*MASK_FOLDERS, "Masks"])
+@pytest.mark.parametrize("name", ["{stem}.png", "{name}.png", "{stem}.PNG", "{stem}.jpg"])
+@pytest.mark.parametrize("layout", ["inside", "next to images", "colmap", "transforms"])
+def test_masks_of_every_name(tmp_path, folder, name, layout):
+    made = scenes.capture(views=3, size=24)
+    if layout == "inside":
+        images = photos(tmp_path)
+        place = tmp_path / folder
+    else:
+        images = photos(tmp_path / "images")
+        place = tmp_path / folder
+    place.mkdir()
+    for file in sorted(images.glob("*.png")):
+        target = place / name.format(stem=file.stem, name=file.name)
+        Image.fromarray(MASK).save(target, format="PNG")
+    if layout in ("inside", "next to images"):
+        masks = [one.mask for one in read_photos(tmp_path)]
+    else:
+        K = made.views[0].camera.K
+        if layout == "transforms":
+            frames = [
+                {"file_path": f"images/{i}.png", "transform_matrix": np.eye(4).tolist()}
+                for i in range(3)
+            ]
+            text = {"fl_x": 30.0, "w": 32, "h": 24, "frames": frames}
+            (tmp_path / "transforms.json").write_text(json.dumps(text))
+        else:
+            model = tmp_path / "sparse" / "0"
+            model.mkdir(parents=True)
+            (model / "cameras.txt").write_text("1 SIMPLE_PINHOLE 32 24 30 16 12\n")
+            lines = [f"{i + 1} 1 0 0 0 {i} 0 0 1 {i}.png\n\n" for i in range(3)]
+            (model / "images.txt").write_text("".join(lines))
+            (model / "points3D.txt").write_text("")
+        assert K.shape == (3, 3)
+        masks = [view.mask for view in igsr.load_capture(tmp_path).views]
+    assert all(mask is not None and np.array_equal(mask, MASK > 0) for mask in masks)
+
+
+@pytest.mark.parametrize("name", ["{stem}_mask.png", "{name}.mask.png"])
+def test_masks_beside_their_photos(tmp_path, name):
+    photos(tmp_path)
+    for stem in "01":
+        file = tmp_path / name.format(stem=stem, name=f"{stem}.png")
+        Image.fromarray(MASK).save(file)
+    loaded = read_photos(tmp_path)
+    assert [one.name for one in loaded] == ["0.png", "1.png", "2.png"]
+    assert [one.mask is not None for one in loaded] == [True, True, False]
+    assert "3 photos" in str(look_at(tmp_path).train) + " photos"
+
+
+def test_masks_of_other_names_are_reported(tmp_path):
+    photos(tmp_path)
+    (tmp_path / "masks").mkdir()
+    Image.fromarray(MASK).save(tmp_path / "masks" / "other.png")
+    with pytest.warns(UserWarning, match=r"No mask in .*masks has the name of a photo \(other.png"):
+        read_photos(tmp_path)
+
+
+def test_videos_of_live_photos_are_left_out(tmp_path):
+    photos(tmp_path)
+    for index in range(3):
+        (tmp_path / f"{index}.MOV").write_bytes(b"")
+    assert found(tmp_path) == (["0.png", "1.png", "2.png"], "3 videos named like photos")
+    seen = look_at(tmp_path)
+    assert (seen.train, seen.left_out) == (3, "3 videos named like photos")
+
+
+@pytest.mark.parametrize(
+    ("folders", "names", "left_out"),
+    [
+        # Polycam
+        (
+            {"keyframes/images": 3, "keyframes/depth": 3, "keyframes/confidence": 3},
+            "keyframes/images/{}.png",
+            "3 in confidence/, 3 in depth/",
+        ),
+        (
+            {"keyframes/images": 3, "keyframes/corrected_images": 3},
+            "keyframes/corrected_images/{}.png",
+            "3 in images/",
+        ),
+        # Record3D
+        ({"rgb": 3, "depth": 3, "conf": 3}, "rgb/{}.png", "3 in conf/, 3 in depth/"),
+        # nerfstudio, LLFF
+        (
+            {"images": 3, "images_2": 3, "images_8": 3, "depths": 3, "masks": 3, ".": 1},
+            "{}.png",
+            "3 in depths/, 3 in images_2/, 3 in images_8/, 1 outside of images/",
+        ),
+        ({"images": 3, "Thumbnails": 3}, "{}.png", "3 in Thumbnails/"),
+        # Cameras of a rig have photos of the same names.
+        ({"a": 2, "b": 1}, None, ""),
+    ],
+)
+def test_folders_beside_photos(tmp_path, folders, names, left_out):
+    for index, (folder, count) in enumerate(folders.items()):
+        for number in range(count):
+            photo(tmp_path / folder / f"{number}.png", 10 * index + number)
+    expected = ["a/0.png", "a/1.png", "b/0.png"]
+    if names is not None:
+        expected = [names.format(number) for number in range(3)]
+    assert found(tmp_path) == (expected, left_out)
+
+
+def test_photos_in_a_folder_of_another_name_count_if_there_are_no_others(tmp_path):
+    photos(tmp_path / "depth")
+    assert found(tmp_path) == (["depth/0.png", "depth/1.png", "depth/2.png"], "")
+
+
+def test_what_igsr_wrote_is_no_photo(tmp_path):
+    photos(tmp_path)
+    before = find_photo_files(tmp_path).files
+    out = tmp_path / "out"
+    photo(out / "view" / "held-out" / "0.png")
+    photo(out / "views.png", 7)
+    (out / "scene.ply").write_bytes(b"")
+    assert find_photo_files(tmp_path).files == before
+    assert found(tmp_path)[1] == "2 written by igsr"
+
+
+def test_what_igsr_rendered_is_no_photo(igsr_here, tmp_path):
+    capture = scenes.capture(views=3, size=24)
+    scenes.write_capture(tmp_path / "capture", capture)
+    scenes.splats().save(tmp_path / "scene.ply")
+    folder = photos(tmp_path / "photos")
+    for words in (
+        ["--cameras", tmp_path / "capture", "--out", folder],
+        ["--cameras", tmp_path / "capture", "--orbit", 4, "--out", folder / "orbit.mp4"],
+    ):
+        done = igsr_here("render", tmp_path / "scene.ply", *words, "--backend", "cpu")
+        assert done.returncode == 0, done.stderr
+    names, left_out = found(folder)
+    assert [name for name in names if "/" not in name] == ["0.png", "1.png", "2.png"]
+    assert "rendered by igsr" in left_out
+    # Alone, they are what somebody wants to fit.
+    for name in "012":
+        (folder / f"{name}.png").unlink()
+    assert len(find_photo_files(folder).files) >= 3
+
+
+def test_links_to_folders_are_followed_once(tmp_path):
+    photos(tmp_path / "elsewhere")
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "link").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "elsewhere" / "loop").symlink_to(tmp_path / "elsewhere")
+    assert found(tmp_path / "photos") == ([f"link/{i}.png" for i in range(3)], "")
+    assert has_photos(tmp_path / "photos")
+
+
+@pytest.mark.parametrize(
+    ("suffix", "form"),
+    [
+        (".heic", "JPEG"),
+        (".jfif", "JPEG"),
+        (".jpe", "JPEG"),
+        (".mpo", "MPO"),
+        (".avif", "AVIF"),
+        (".png", "JPEG"),
+    ],
+)
+def test_photos_are_read_by_content(tmp_path, suffix, form):
+    pixels = np.full((24, 32, 3), 90, np.uint8)
+    for name in "ab":
+        more = (
+            {"save_all": True, "append_images": [Image.fromarray(pixels)]} if form == "MPO" else {}
+        )
+        Image.fromarray(pixels).save(tmp_path / f"{name}{suffix}", format=form, **more)
+    assert all(abs(int(one.image.mean()) - 90) < 3 for one in read_photos(tmp_path))
+
+
+def test_raw_photos_are_named(tmp_path):
+    photos(tmp_path)
+    (tmp_path / "3.DNG").write_bytes(b"II*\0")
+    assert found(tmp_path)[1] == "1 .dng (export them as JPEG)"
+    for index in range(3):
+        (tmp_path / f"{index}.png").unlink()
+    with pytest.raises(IgsrError, match=r"holds no photos besides 1 \.dng \(export them as JPEG\)"):
+        find_photo_files(tmp_path)
+
+
+def test_paths_from_windows(tmp_path):
+    made = scenes.capture(views=4, size=24)
+    scenes.write_capture(tmp_path, made)
+    path = tmp_path / "transforms.json"
+    document = json.loads(path.read_text())
+    before = igsr.load_capture(tmp_path)
+    for frame in document["frames"]:
+        frame["file_path"] = frame["file_path"].replace("/", "\\")
+    path.write_bytes(b"\xef\xbb\xbf" + json.dumps(document).encode())
+    assert igsr.load_capture(tmp_path) == before
+
+
+def test_colmap_models_from_windows(tmp_path):
+    for camera in ("a", "b"):
+        photos(tmp_path / "images" / camera, 2)
+    model = tmp_path / "sparse" / "0"
+    model.mkdir(parents=True)
+    # The camera that no photo has is of an unknown model.
+    cameras = "1 SIMPLE_PINHOLE 32 24 30 16 12\n2 NEW_MODEL 32 24 1 2 3\n"
+    (model / "cameras.txt").write_bytes(b"\xef\xbb\xbf" + cameras.encode())
+    names = [f"{camera}\\{i}.png" for camera in "ab" for i in range(2)]
+    lines = [f"{i + 1} 1 0 0 0 {i} 0 0 1 {name}\r\n\r\n" for i, name in enumerate(names)]
+    (model / "images.txt").write_bytes(b"\xef\xbb\xbf" + "".join(lines).encode())
+    (model / "points3D.txt").write_bytes(b"\xef\xbb\xbf")
+    capture = igsr.load_capture(tmp_path)
+    assert [view.name for view in capture.views] == [
+        f"images/{name}".replace("\\", "/") for name in names
+    ]
+    shutil.rmtree(tmp_path / "images" / "b")
+    with pytest.raises(IgsrError, match=r"b/0\.png is missing"):
+        igsr.load_capture(tmp_path)
+
+
+def test_a_kept_mask_counts_in_the_first_sentence(igsr_here, tmp_path):
+    made = scenes.capture(views=4, size=24)
+    scenes.write_capture(tmp_path / "capture", made)
+    masks = tmp_path / "capture" / "masks"
+    masks.mkdir()
+    for view in made.views:
+        name = view.name.split("/")[-1].replace(".png", "")
+        Image.fromarray(np.full((24, 24), 255, np.uint8)).save(masks / f"{name}.png")
+    done = igsr_here(
+        "fit", tmp_path / "capture", "--steps", 2, "--backend", "cpu", "--out", tmp_path / "out"
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Found 4 photos of 24x24, 4 of them with masks" in done.stdout + done.stderr
