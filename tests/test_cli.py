@@ -194,7 +194,7 @@ def test_info_describes_scenes_captures_and_backends(fitted, capture_path):
 def test_info_counts_non_finite_splats(tmp_path, igsr_here):
     splats = scenes.splats()
     splats.means[3] = np.nan
-    splats.opacities[4] = np.inf
+    splats.scales[4] = np.inf
     splats.save(tmp_path / "scene.ply")
     report = json.loads(igsr_here("info", tmp_path / "scene.ply", "--json").stdout)
     assert report["not_finite"] == 2

@@ -2,8 +2,10 @@
 
 import json
 import os
+import re
 import warnings
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +16,8 @@ from typer.testing import CliRunner
 
 import igsr
 from igsr.cli import app
-from igsr.splats import SPLAT_ENDINGS
+from igsr.rendering.renders import render
+from igsr.splats import SPLAT_ENDINGS, Splats
 
 WRITABLE = ("ply", "compressed.ply", "splat", "spz", "sog", "glb", "gltf")
 #: An optional folder of splat files from other programs.
@@ -205,6 +208,84 @@ def test_doubles_are_read_and_flat_splats_are_named(tmp_path):
     foreign_ply(tmp_path / "a.ply", scales=2)
     with pytest.raises(igsr.IgsrError, match=r"a\.ply: has flat splats of 2DGS"):
         igsr.Splats.load(tmp_path / "a.ply")
+
+
+def ply_with(path, model, **columns):
+    """Write a model with changed or further columns."""
+    model.save(path)
+    head, body = path.read_bytes().split(b"end_header\n", 1)
+    names = re.findall(r"property float (\S+)", head.decode())
+    rows = np.frombuffer(body, "<f4").reshape(len(model), -1)
+    table = dict(zip(names, rows.T, strict=True)) | columns
+    new = [name for name in columns if name not in names]
+    head += b"".join(b"property float %s\n" % name.encode() for name in new)
+    values = np.stack([np.broadcast_to(value, len(model)) for value in table.values()], axis=1)
+    path.write_bytes(head + b"end_header\n" + values.astype("<f4").tobytes())
+
+
+def test_infinite_logits_and_flat_splats_are_drawn(tmp_path, igsr_here):
+    model, camera = scenes.splats(count=60), scenes.ring_camera(0.3)
+    opaque = replace(model, opacities=np.full(60, 30.0, np.float32))
+    flat = replace(
+        model,
+        scales=model.scales * np.array([1, 1, 0], np.float32) - np.array([0, 0, 30], np.float32),
+    )
+    for name, columns, same in (
+        ("opaque.ply", {"opacity": np.inf}, opaque),
+        ("flat.ply", {"scale_2": -np.inf}, flat),
+    ):
+        path = tmp_path / name
+        ply_with(path, model, **columns)
+        read = Splats.load(path)
+        assert read.finite.all()
+        difference = render(read, camera).color - render(same, camera).color
+        assert np.abs(difference).max() < 1e-5
+        done = igsr_here("convert", path, tmp_path / "out.spz")
+        assert done.returncode == 0
+        assert "60 splats" in done.stdout
+    ply_with(tmp_path / "clear.ply", model, opacity=-np.inf)
+    assert render(Splats.load(tmp_path / "clear.ply"), camera).alpha.max() == 0.0
+
+
+def test_splats_that_are_not_finite_are_counted(tmp_path, igsr_here):
+    model = scenes.splats(count=60)
+    model.means[:3] = np.nan
+    model.save(tmp_path / "scene.ply")
+    done = igsr_here("render", tmp_path / "scene.ply", "--orbit", 2, "--out", tmp_path / "o.mp4")
+    assert "3 of 60 splats are not finite and not drawn." in done.stderr
+
+
+def test_the_filter_of_mip_splatting_is_applied(tmp_path):
+    model = scenes.splats(count=60)
+    ply_with(tmp_path / "mip.ply", model, filter_3D=0.1)
+    with pytest.warns(UserWarning, match="3D filter of Mip-Splatting is applied"):
+        read = Splats.load(tmp_path / "mip.ply")
+    variances = np.exp(2.0 * model.scales.astype(np.float64))
+    wider = variances + 0.1**2
+    kept = np.sqrt((variances / wider).prod(axis=1))
+    opacities = kept / (1.0 + np.exp(-model.opacities.astype(np.float64)))
+    np.testing.assert_allclose(np.exp(2.0 * read.scales), wider, rtol=1e-5)
+    np.testing.assert_allclose(1.0 / (1.0 + np.exp(-read.opacities)), opacities, rtol=1e-5)
+    assert read.antialiased
+
+
+def test_logarithms_of_scales_in_gltf_are_read(tmp_path):
+    # As splat-transform wrote them until June 2026; the specification asks for linear scales.
+    model, path = scenes.splats(count=60), tmp_path / "scene.glb"
+    model.save(path)
+    content = path.read_bytes()
+    linear = np.exp(model.scales.astype(np.float64)).astype(np.float32)
+    found = [
+        o
+        for o in range(0, len(content) - 12, 4)
+        if np.allclose(np.frombuffer(content, "<f4", 3, o), linear[0], rtol=1e-6)
+    ]
+    assert len(found) == 1
+    logs = np.log(np.frombuffer(content, "<f4", 180, found[0])).tobytes()
+    path.write_bytes(content[: found[0]] + logs + content[found[0] + 720 :])
+    with pytest.warns(UserWarning, match="its scales are logarithms"):
+        read = Splats.load(path)
+    np.testing.assert_allclose(read.scales, model.scales, atol=1e-5)
 
 
 def test_an_unknown_required_extension_is_named(tmp_path):

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from igsr._internal.event import CAMERAS_FOUND, NOTE, SCENE_WRITTEN, Event, Listener
+from igsr._internal.folder_lock import folder_lock
 from igsr._internal.part_usage import Parts
 from igsr._internal.progress_bar import is_interactive, nested, progress_bar
 from igsr.errors import IgsrError
@@ -77,9 +78,15 @@ def open_run(
 ) -> Iterator[Run]:
     """A run that shows a progress bar in interactive sessions where ``progress`` is None.
 
-    Runs within a run show no bars of their own.
+    Runs within a run show no bars of their own, and write into its folder.
+
+    Raises:
+        IgsrError: as ``Run``, or another run writes into the folder.
     """
     with nested() as is_outermost, contextlib.ExitStack() as closing:
         if progress is None and is_outermost and is_interactive():
             progress = closing.enter_context(progress_bar())
-        yield Run(out, () if progress is None else (progress,), resume=resume)
+        run = Run(out, () if progress is None else (progress,), resume=resume)
+        if run.out is not None and is_outermost:
+            closing.enter_context(folder_lock(run.out))
+        yield run

@@ -18,6 +18,7 @@ from igsr import _core
 from igsr._internal.array_equality import ArrayEquality
 from igsr._internal.extras import naming_extra
 from igsr._internal.notebook import NotebookPicture, numbers
+from igsr._internal.user_warning import warn_user
 from igsr.errors import IgsrError
 
 if TYPE_CHECKING:
@@ -307,6 +308,9 @@ class Splats(ArrayEquality, NotebookPicture):
         for note in read["notes"]:
             warnings.warn(f"{path}: {note}", stacklevel=2)
         splats = Splats(**{part.name: read[part.name] for part in fields(Splats)})
+        broken = len(splats) - int(splats.finite.sum())
+        if broken:
+            warn_user(f"{path}: {broken} of {len(splats)} splats are not finite and not drawn.")
         logger.info("%s: %r", path, splats)
         return splats
 

@@ -12,8 +12,7 @@ const NEAR_PART: f64 = 0.002;
 /// Center of the visible splats, relative to their origin, and the radius with 90 % of them, at most four
 /// times the radius with 50 %. Medians, because captures have a few splats very far out.
 pub fn extent(means: &[[f32; 3]], opacities: &[f32]) -> (DVec3, f64) {
-    let is_finite =
-        |&i: &usize| means[i].iter().all(|v| v.is_finite()) && opacities[i].is_finite();
+    let is_finite = |&i: &usize| means[i].iter().all(|v| v.is_finite()) && opacities[i].is_finite();
     let step = means.len().div_ceil(SAMPLES).max(1);
     let all: Vec<usize> = (0..means.len()).step_by(step).filter(is_finite).collect();
     let mut seen: Vec<usize> =

@@ -2,8 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
-use splat_render::extent::near_plane;
 use splat_render::Result;
+use splat_render::extent::near_plane;
 
 use crate::detail::view;
 use crate::loader::Loaded;

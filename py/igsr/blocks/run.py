@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from igsr._internal.event import Listener
+from igsr._internal.folder_lock import folder_lock
 from igsr._internal.json_file import write_json
 from igsr._internal.part_usage import Parts
 from igsr.blocks.cells import grid_of
@@ -54,13 +55,20 @@ def fit_in_blocks(
         The joined scene, and the content of ``report.json``.
 
     Raises:
-        IgsrError: the capture cannot be used, a block cannot be fitted, or a file cannot be
-            written; the message names the block.
+        IgsrError: the capture cannot be used, a block cannot be fitted, a file cannot be written,
+            or another run writes into ``out``; the message names the block.
         UserWarning: a block has no photos or no splats, a block is fitted again after its process
             was lost, or machines of the cluster differ.
     """
-    parts = Parts()
     _check(options)
+    with folder_lock(out):
+        return _fit_in_blocks(path, out, options, progress)
+
+
+def _fit_in_blocks(
+    path: Path, out: Path, options: BlockOptions, progress: Listener | None
+) -> tuple[Splats, dict[str, Any]]:
+    parts = Parts()
     with parts.measured("plan"):
         manifest = read_manifest(path, options.max_size, options.holdout)
         train = manifest.of_split("train")

@@ -38,6 +38,8 @@ def debugging() -> bool:
 def error_messages(interrupted: Callable[[], str] = lambda: "Interrupted.") -> Iterator[None]:
     """Turn errors that a user can fix into one message on stderr and a non-zero exit status.
 
+    Warnings become messages, too.
+
     Other exceptions are bugs and pass through with their traceback.
 
     Args:
@@ -47,7 +49,8 @@ def error_messages(interrupted: Callable[[], str] = lambda: "Interrupted.") -> I
         typer.Exit: with status 1, ``INTERRUPTED`` or ``TERMINATED``.
     """
     try:
-        with _sigterm_raises():
+        with _sigterm_raises(), warnings.catch_warnings():
+            warnings.showwarning = lambda message, *rest: print_message(str(message))
             yield
     except typer.Exit:  # a RuntimeError
         raise
@@ -82,14 +85,6 @@ def _sigterm_raises() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_DFL if before is None else before)
-
-
-@contextlib.contextmanager
-def warning_messages() -> Iterator[None]:
-    """Print igsr's warnings as they come, each as one line on stderr."""
-    with warnings.catch_warnings():
-        warnings.showwarning = lambda message, *rest: print_message(str(message))
-        yield
 
 
 def print_message(message: str) -> None:

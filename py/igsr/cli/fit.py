@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from igsr._internal.event import Event
 from igsr._internal.progress_bar import progress_bar
 from igsr.capture.photo_folder import FRAMES
-from igsr.cli.error_messages import error_messages, warning_messages
+from igsr.cli.error_messages import error_messages
 from igsr.cli.options import (
     ADVANCED,
     FIT,
@@ -145,7 +145,7 @@ def fit_command(
             "--resume continues."
         )
 
-    with error_messages(interrupted), warning_messages():
+    with error_messages(interrupted):
         path = photos_or_example(photos, example, out)
         settings: dict[str, Any] = {
             "quality": quality,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from igsr._internal.progress_bar import progress_bar
 from igsr.cli.denoiser_option import DenoiserOption, chosen_denoiser
-from igsr.cli.error_messages import error_messages, warning_messages
+from igsr.cli.error_messages import error_messages
 from igsr.cli.options import (
     FIT,
     AllowMissingOption,
@@ -66,10 +66,7 @@ def refine_command(
 
     A round is accepted only if it improves cross-validation scores.
     """
-    with (
-        error_messages(lambda: f"Interrupted; the same command with --resume continues in {out}."),
-        warning_messages(),
-    ):
+    with error_messages(lambda: f"Interrupted; the same command with --resume continues in {out}."):
         from igsr.refinement import refine, round_denoiser
 
         # Before the example is written: it may need torch, or not exist.

@@ -3,17 +3,35 @@
 //! Properties: x y z, nx ny nz (zero), f_dc_0..2, f_rest_* (all red, then green, then blue), opacity
 //! (logit), scale_0..2 (logs), rot_0..3 (wxyz). A header line `comment origin X Y Z` holds a nonzero f64
 //! origin, and means are then relative to it; `comment SplatRenderMode: mip` marks antialiased opacities.
-//! Doubles are read, too.
+//! Doubles are read, too, and the 3D filter of Mip-Splatting (Yu et al. 2024, eq. 7), `filter_3D`, is applied.
 
 use std::io::{BufRead, Write};
 
 use super::bytes::{Named, f32_at};
 use super::ply_header::{Header, Kind, write_comments};
+use super::quantize::{logit, sigmoid};
 use super::{Format, Loaded, SplatFile};
 use crate::constants::SH_DEGREE_MAX;
 use crate::error::Result;
 use crate::sh;
 use crate::splats::SplatArrays;
+
+/// Column of Mip-Splatting's filter.
+pub const FILTER: &str = "filter_3D";
+/// For infinite logits and negative infinite log-scales: their sigmoid and exponential are exact in f32.
+const INFINITE_LOG: f32 = 80.0;
+
+/// Applies a 3D filter of standard deviation `filter` to a splat.
+fn filtered(scales: &mut [f32; 3], opacity: &mut f32, filter: f32) {
+    let mut kept = 1.0;
+    for scale in scales {
+        let variance = (2.0 * f64::from(*scale)).exp();
+        let wider = variance + f64::from(filter).powi(2);
+        kept *= (variance / wider).sqrt();
+        *scale = (0.5 * wider.ln()) as f32;
+    }
+    *opacity = logit(sigmoid(*opacity) * kept);
+}
 
 /// First byte in a row, and whether it is a double.
 type Column = (usize, bool);
@@ -28,6 +46,7 @@ pub struct Rows {
     opacity: Vec<Column>,
     dc: Vec<Column>,
     rest: Vec<Column>,
+    filter: Option<Column>,
     row: Vec<u8>,
 }
 
@@ -41,10 +60,12 @@ impl Rows {
         if vertex.lists {
             return Err(named.bad("holds lists in its vertices; it is a mesh, not splats"));
         }
-        let need = |name: &str| {
+        let find = |name: &str| {
             let float = vertex.offset(name, Kind::Float).map(|at| (at, false));
-            let column = float.or(vertex.offset(name, Kind::Double).map(|at| (at, true)));
-            column.ok_or_else(|| match name {
+            float.or(vertex.offset(name, Kind::Double).map(|at| (at, true)))
+        };
+        let need = |name: &str| {
+            find(name).ok_or_else(|| match name {
                 "scale_2" => named.bad("has flat splats of 2DGS; only 3DGS's can be read"),
                 _ => named.bad(format!(
                     "has no float property '{name}'; it is not a .ply of Gaussian splats"
@@ -75,7 +96,8 @@ impl Rows {
             )));
         }
         let (count, row) = (vertex.count as usize, vec![0u8; vertex.stride]);
-        Ok(Self { count, degree, xyz, quat, scale, opacity, dc, rest, row })
+        let filter = find(FILTER);
+        Ok(Self { count, degree, xyz, quat, scale, opacity, dc, rest, filter, row })
     }
 
     /// Reads the next row, of splat `number`, into splat `i`.
@@ -99,6 +121,18 @@ impl Rows {
         splats.quats[i] = std::array::from_fn(|k| at(self.quat[k]));
         splats.scales[i] = std::array::from_fn(|k| at(self.scale[k]));
         splats.opacities[i] = at(self.opacity[0]);
+        if let Some(column) = self.filter {
+            filtered(&mut splats.scales[i], &mut splats.opacities[i], at(column));
+        }
+        // An opacity of 1, and a flat splat, as finite numbers.
+        for value in splats.scales[i].iter_mut().chain([&mut splats.opacities[i]]) {
+            if *value == f32::NEG_INFINITY {
+                *value = -INFINITE_LOG;
+            }
+        }
+        if splats.opacities[i] == f32::INFINITY {
+            splats.opacities[i] = INFINITE_LOG;
+        }
         splats.sh[i * stride] = std::array::from_fn(|c| at(self.dc[c]));
         for k in 0..stride - 1 {
             splats.sh[i * stride + 1 + k] =
@@ -123,7 +157,10 @@ pub fn read(
     Ok(Loaded {
         file: SplatFile { splats, origin: header.origin, antialiased: header.antialiased },
         format: Format::Ply,
-        notes: Vec::new(),
+        notes: match rows.filter {
+            Some(_) => vec!["the 3D filter of Mip-Splatting is applied to its splats.".to_owned()],
+            None => Vec::new(),
+        },
     })
 }
 

@@ -4,6 +4,7 @@ use std::io::{BufRead, Read, Write};
 
 use super::bytes::Named;
 use super::limits::SPLATS_MAX;
+use super::ply::FILTER;
 use super::splat_file::SplatFile;
 use crate::error::Result;
 
@@ -70,7 +71,7 @@ pub struct Header {
     pub elements: Vec<Element>,
     /// `comment origin X Y Z`, else zero.
     pub origin: [f64; 3],
-    /// `comment SplatRenderMode: mip`.
+    /// `comment SplatRenderMode: mip`, or splats of Mip-Splatting.
     pub antialiased: bool,
 }
 
@@ -139,6 +140,7 @@ impl Header {
                         named.bad(format!("has a property of unknown type {kind}"))
                     })?;
                     if let Some(element) = header.elements.last_mut() {
+                        header.antialiased |= *name == FILTER;
                         let offset = element.stride;
                         element.properties.push(Property {
                             name: (*name).to_owned(),

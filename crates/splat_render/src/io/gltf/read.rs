@@ -28,6 +28,8 @@ struct Part<'a> {
     positions: Accessor<'a>,
     rotations: Accessor<'a>,
     scales: Accessor<'a>,
+    /// Whether scales are logarithms: linear ones are not negative.
+    is_log: bool,
     opacities: Accessor<'a>,
     sh: Vec<Accessor<'a>>,
 }
@@ -63,6 +65,10 @@ pub fn parse(bytes: &[u8], format: Format, named: &Named<'_>) -> Result<Loaded> 
         return Err(
             named.bad(format!("shows no splats ({EXTENSION}); give a file of Gaussian splats"))
         );
+    }
+    if parts.iter().any(|part| part.is_log) {
+        notes
+            .push("its scales are logarithms, which glTF does not allow; read as such.".to_owned());
     }
     if others > 0 {
         notes.push(format!("{others} meshes without splats are ignored."));
@@ -144,13 +150,16 @@ impl<'a> Part<'a> {
             }
             degree = next;
         }
+        let scales = need(SCALE, 3)?;
+        let is_log = (0..scales.count).any(|i| scales.row::<3>(i).iter().any(|&v| v < 0.0));
         let part = Self {
             at,
+            is_log,
             count: positions.count,
             degree,
             positions,
             rotations: need(ROTATION, 4)?,
-            scales: need(SCALE, 3)?,
+            scales,
             opacities: need(OPACITY, 1)?,
             sh,
         };
@@ -176,7 +185,10 @@ impl<'a> Part<'a> {
             splats.means[to] = self.positions.row(i);
             let [x, y, z, w] = self.rotations.row::<4>(i);
             splats.quats[to] = [w, x, y, z];
-            splats.scales[to] = self.scales.row::<3>(i).map(log_scale);
+            splats.scales[to] = self.scales.row::<3>(i);
+            if !self.is_log {
+                splats.scales[to] = splats.scales[to].map(log_scale);
+            }
             let [opacity] = self.opacities.row::<1>(i);
             splats.opacities[to] = logit(f64::from(opacity));
             let row = &mut splats.sh[to * stride..(to + 1) * stride];
