@@ -1,4 +1,4 @@
-"""Which files of a folder are photos of the scene, which are masks, and what is left out."""
+"""Photos, masks and skipped files of folders."""
 
 import json
 import shutil
@@ -33,7 +33,7 @@ def photos(folder, count=3, suffix=".png"):
 
 def found(folder):
     files = find_photo_files(folder)
-    return [file.relative_to(files.root).as_posix() for file in files.files], files.left_out_words()
+    return [file.relative_to(files.root).as_posix() for file in files.files], files.skipped_words()
 
 
 @pytest.mark.parametrize("folder", [*MASK_FOLDERS, "Masks"])
@@ -94,17 +94,17 @@ def test_masks_of_other_names_are_reported(tmp_path):
         read_photos(tmp_path)
 
 
-def test_videos_of_live_photos_are_left_out(tmp_path):
+def test_videos_of_live_photos_are_skipped(tmp_path):
     photos(tmp_path)
     for index in range(3):
         (tmp_path / f"{index}.MOV").write_bytes(b"")
     assert found(tmp_path) == (["0.png", "1.png", "2.png"], "3 videos named like photos")
     seen = look_at(tmp_path)
-    assert (seen.train, seen.left_out) == (3, "3 videos named like photos")
+    assert (seen.train, seen.skipped) == (3, "3 videos named like photos")
 
 
 @pytest.mark.parametrize(
-    ("folders", "names", "left_out"),
+    ("folders", "names", "skipped"),
     [
         # Polycam
         (
@@ -130,14 +130,14 @@ def test_videos_of_live_photos_are_left_out(tmp_path):
         ({"a": 2, "b": 1}, None, ""),
     ],
 )
-def test_folders_beside_photos(tmp_path, folders, names, left_out):
+def test_folders_beside_photos(tmp_path, folders, names, skipped):
     for index, (folder, count) in enumerate(folders.items()):
         for number in range(count):
             photo(tmp_path / folder / f"{number}.png", 10 * index + number)
     expected = ["a/0.png", "a/1.png", "b/0.png"]
     if names is not None:
         expected = [names.format(number) for number in range(3)]
-    assert found(tmp_path) == (expected, left_out)
+    assert found(tmp_path) == (expected, skipped)
 
 
 def test_photos_in_a_folder_of_another_name_count_if_there_are_no_others(tmp_path):
@@ -167,10 +167,10 @@ def test_what_igsr_rendered_is_no_photo(igsr_here, tmp_path):
     ):
         done = igsr_here("render", tmp_path / "scene.ply", *words, "--backend", "cpu")
         assert done.returncode == 0, done.stderr
-    names, left_out = found(folder)
+    names, skipped = found(folder)
     assert [name for name in names if "/" not in name] == ["0.png", "1.png", "2.png"]
-    assert "rendered by igsr" in left_out
-    # Alone, they are what somebody wants to fit.
+    assert "rendered by igsr" in skipped
+    # A folder of renders only can be fitted.
     for name in "012":
         (folder / f"{name}.png").unlink()
     assert len(find_photo_files(folder).files) >= 3

@@ -364,7 +364,7 @@ def read_level(path: str, most: int) -> dict[str, Any]:
 def splat_extent(
     means: Float32, opacities: Float32
 ) -> tuple[tuple[float, float, float], float, float]:
-    """Center of visible splats, their radius, and the near plane of pictures."""
+    """Center of visible splats, their radius, and the near plane of renders."""
 
 def morton_order(points: Float32) -> npt.NDArray[np.int64]:
     """Ids of points [N, 3] along Morton's curve, as the writers order splats."""

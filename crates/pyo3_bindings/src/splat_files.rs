@@ -44,7 +44,7 @@ pub fn write_splats(
     py.detach(|| splat_render::io::write_splats(&path, &file)).map_err(to_python)
 }
 
-/// Center [3] of visible splats, relative to their origin, their radius, and the near plane of pictures.
+/// Center [3] of visible splats, relative to their origin, their radius, and the near plane of renders.
 #[pyfunction]
 pub fn splat_extent(
     py: Python<'_>,

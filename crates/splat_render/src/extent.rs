@@ -1,4 +1,4 @@
-//! Where the splats of a scene are, and how near a camera may come to them.
+//! Center and radius of a scene, and the near plane of its renders.
 
 use glam::DVec3;
 
@@ -6,7 +6,7 @@ use glam::DVec3;
 const FAINT_LOGIT: f32 = -2.2;
 /// Number of splats that the extent is computed from.
 const SAMPLES: usize = 20_000;
-/// Near plane of pictures, as a fraction of the scene's radius: that of a fit, in usual captures.
+/// Near plane of renders, as a fraction of the scene's radius; about the near plane of fits.
 const NEAR_PART: f64 = 0.002;
 
 /// Center of the visible splats, relative to their origin, and the radius with 90 % of them, at most four
@@ -29,7 +29,7 @@ pub fn extent(means: &[[f32; 3]], opacities: &[f32]) -> (DVec3, f64) {
     (center, if radius > 0.0 { radius } else { 1.0 })
 }
 
-/// Near plane of pictures of a scene, so that its unit does not change them.
+/// Near plane of renders, which do not depend on the scene's unit.
 pub fn near_plane(radius: f64) -> f32 {
     ((NEAR_PART * radius) as f32).max(f32::MIN_POSITIVE)
 }

@@ -1,7 +1,7 @@
 """A lock on a folder, so that two runs do not write into it at once.
 
-The system releases it when its process ends, however that happens, so no lock is left behind. Where
-a file system has no locks, runs go on without.
+The operating system releases the lock when the process ends, even if it is killed. Runs on file
+systems without locks are not locked.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 from igsr.errors import IgsrError
 
 LOCK_FILE = ".igsr.lock"
-#: Byte that is locked on Windows, where others cannot read locked bytes.
+#: The locked byte on Windows, which does not let other processes read locked bytes.
 _LOCKED_BYTE = 1 << 20
 
 
@@ -30,7 +30,7 @@ def folder_lock(folder: Path) -> Iterator[None]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         file = _locked(folder / LOCK_FILE)
-    except OSError:  # Whatever writes there next says what is wrong.
+    except OSError:  # The first write of the run fails, too, with a better message.
         file = None
     try:
         yield

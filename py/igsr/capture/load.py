@@ -130,14 +130,14 @@ class Overview(PhotoSizes):
         has_cameras: whether it is a capture, whose cameras are known.
         train: number of the photos that are for training; all of them without cameras.
         masks: number of photos with a mask.
-        left_out: what else is there, and is not a photo of the scene.
+        skipped: files that are not photos of the scene, in words.
     """
 
     path: Path
     has_cameras: bool
     train: int
     masks: int = 0
-    left_out: str = ""
+    skipped: str = ""
 
     def train_photos(self, holdout: int | None) -> int:
         """Return the maximum number of photos to fit if every ``holdout``-th is held out."""
@@ -175,6 +175,6 @@ def look_at(
         has_cameras=False,
         train=len(sizes.sizes),
         masks=found.mask_count(),
-        left_out=found.left_out_words(),
+        skipped=found.skipped_words(),
         **vars(sizes),
     )

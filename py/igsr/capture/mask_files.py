@@ -1,9 +1,9 @@
 """Find the masks of photos by their customary names.
 
-Masks are in a folder ``masks``, ``mask``, ``alpha`` or ``alphas``, in the folder of photos or next
-to it, or beside their photos. The mask of ``a/1.jpg`` is ``a/1`` or ``a/1.jpg`` with the suffix of
-an image (COLMAP: ``a/1.jpg.png``), or ``a/1_mask.png`` (Metashape), or ``a/1.jpg.mask.png``
-(RealityScan). White pixels may be used, black ones may not.
+A folder of photos contains its masks in ``masks``, ``mask``, ``alpha`` or ``alphas``, or has that
+folder next to it. The mask of ``a/1.jpg`` is ``a/1.png``, ``a/1.jpg.png`` (COLMAP),
+``a/1_mask.png`` (Metashape) or ``a/1.jpg.mask.png`` (RealityScan), with any image suffix. The last
+two may also be in the folder of the photo. Pixels are used where the mask is white.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from igsr.capture.image_files import SUFFIXES
 
 #: Names of folders of masks, in lower case.
 MASK_FOLDERS = ("masks", "mask", "alpha", "alphas")
-#: Ends of the stems of masks that may be beside their photos.
+#: Ends of the stems of masks in the folder of their photos.
 _MASK_ENDS = (".mask", "_mask")
 
 
@@ -29,7 +29,7 @@ class MaskFiles:
 
         Args:
             folders: the folder of masks is the first that exists.
-            photos: the folder of photos, which may have masks beside them.
+            photos: the folder of photos, which may contain masks, too.
         """
         self.folder = next((folder for folder in folders if folder.is_dir()), None)
         self._files: dict[str, Path] = {}

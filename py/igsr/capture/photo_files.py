@@ -1,4 +1,4 @@
-"""Find the photos and videos of a folder, and what in it is not a photo of the scene."""
+"""Find the photos and videos of a folder, and skip images that are not photos of the scene."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from igsr.errors import IgsrError
 
 Paths = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 
-#: Subfolders beside photos that do not hold photos, in lower case (Polycam, Record3D, nerfstudio,
-#: COLMAP and others).
+#: Subfolders that usually contain no photos, in lower case (Polycam, Record3D, nerfstudio, COLMAP
+#: and others).
 OTHER_FOLDERS = (
     *MASK_FOLDERS,
     *("depth", "depths", "depth_maps", "confidence", "confidences", "conf", "normal", "normals"),
@@ -39,17 +39,17 @@ class PhotoFiles:
         root: folder that names are relative to.
         files: photos and videos, sorted by name.
         masks: of the photos.
-        left_out: number of files that were left out, by what they are.
+        skipped: number of skipped files by reason.
     """
 
     root: Path
     files: list[Path]
     masks: MaskFiles
-    left_out: Counter[str] = field(default_factory=Counter)
+    skipped: Counter[str] = field(default_factory=Counter)
 
-    def left_out_words(self) -> str:
-        """Say what was left out, or nothing."""
-        return ", ".join(f"{count} {what}" for what, count in self.left_out.items())
+    def skipped_words(self) -> str:
+        """The skipped files in words, or an empty string."""
+        return ", ".join(f"{count} {what}" for what, count in self.skipped.items())
 
     def mask_of(self, file: Path) -> Path | None:
         """The mask of one of the files."""
@@ -73,16 +73,16 @@ def find_photo_files(path: Paths) -> PhotoFiles:
         return _listed_files([folder])
     try:
         if not folder.is_dir():
-            raise IgsrError(f"{folder} does not exist or is no folder; give a folder of photos")
+            raise IgsrError(f"{folder} does not exist or is not a folder; give a folder of photos")
         found = _found(folder)
     except IgsrError:  # a ValueError, too
         raise
     except (OSError, ValueError) as error:
         raise IgsrError(f"{folder} cannot be read; give a folder of photos") from error
     if not found.files:
-        left_out = f" besides {found.left_out_words()}" if found.left_out else ""
+        skipped = f" besides {found.skipped_words()}" if found.skipped else ""
         raise IgsrError(
-            f"{folder} holds no photos{left_out}; give a folder with JPEG, PNG, WebP or HEIC files"
+            f"{folder} holds no photos{skipped}; give a folder with JPEG, PNG, WebP or HEIC files"
         )
     return found
 
@@ -130,7 +130,7 @@ def _walk(root: Path) -> Iterator[_Place]:
 
 
 def _other_folder(path: Path, name: str, siblings: Sequence[str]) -> str | None:
-    """What a folder holds instead of photos of the scene, or None."""
+    """The reason to skip a folder, or None."""
     if any(is_file(path / name / file) for file in OWN_FILES):
         return "written by igsr"
     lower = [sibling.lower() for sibling in siblings]
@@ -146,33 +146,33 @@ def _is_photo(path: Path) -> bool:
 
 
 def _found(folder: Path) -> PhotoFiles:
-    """The photos of the scene in a folder. What looks like none counts if there is nothing else."""
+    """The photos of the scene in a folder. If all folders would be skipped, none is."""
     places = list(_walk(folder))
     scene = [place for place in places if place.other is None and place.photos] or places
-    left_out: Counter[str] = Counter()
+    skipped: Counter[str] = Counter()
     for place in places:
         if place not in scene and place.path.name.lower() not in MASK_FOLDERS:
-            left_out[str(place.other)] += len(place.photos)
+            skipped[str(place.other)] += len(place.photos)
     root = folder
     inside = [place for place in scene if _is_in_images(place.path.relative_to(folder))]
     direct = sum(len(place.photos) for place in scene if place.path == folder)
     if sum(len(place.photos) for place in inside) > direct:
         root = folder / inside[0].path.relative_to(folder).parts[0]
-        left_out["outside of images/"] += sum(len(place.photos) for place in scene)
-        left_out["outside of images/"] -= sum(len(place.photos) for place in inside)
+        skipped["outside of images/"] += sum(len(place.photos) for place in scene)
+        skipped["outside of images/"] -= sum(len(place.photos) for place in inside)
         scene = inside
-    files = [file for place in scene for file in _of_scene(place, left_out)]
+    files = [file for place in scene for file in _of_scene(place, skipped)]
     files.sort(key=lambda file: file.relative_to(root).as_posix())
     for suffix in sorted(Path(name).suffix.lower() for place in places for name in place.unread):
-        left_out[f"{suffix} (export them as JPEG)"] += 1
-    return PhotoFiles(root, files, MaskFiles.beside(root), +left_out)
+        skipped[f"{suffix} (export them as JPEG)"] += 1
+    return PhotoFiles(root, files, MaskFiles.beside(root), +skipped)
 
 
 def _is_in_images(place: Path) -> bool:
     return bool(place.parts) and place.parts[0].lower() == "images"
 
 
-def _of_scene(place: _Place, left_out: Counter[str]) -> Iterator[Path]:
+def _of_scene(place: _Place, skipped: Counter[str]) -> Iterator[Path]:
     """The photos in a folder, without masks, Live Photos' videos and igsr's renders."""
     names = {name.lower() for name in place.photos}
     videos = [name for name in place.photos if name.lower().endswith(VIDEO_SUFFIXES)]
@@ -182,9 +182,9 @@ def _of_scene(place: _Place, left_out: Counter[str]) -> Iterator[Path]:
         if is_mask_beside(name, names | stems):
             continue
         if name in videos and Path(name).stem.lower() in stems:
-            left_out["videos named like photos"] += 1
+            skipped["videos named like photos"] += 1
         elif name in renders and len(renders) < len(place.photos):
-            left_out["rendered by igsr"] += 1
+            skipped["rendered by igsr"] += 1
         else:
             yield place.path / name
 
@@ -208,7 +208,7 @@ def _listed_files(files: list[Path]) -> PhotoFiles:
         raise IgsrError("photos is an empty list; give at least two photos")
     for file in files:
         if not is_file(file):
-            raise IgsrError(f"{file} does not exist or is no file; give photos or one folder")
+            raise IgsrError(f"{file} does not exist or is not a file; give photos or one folder")
         if file.suffix.lower() not in SUFFIXES + VIDEO_SUFFIXES:
             raise IgsrError(f"{file} is no photo by its name; give JPEG, PNG, WebP or HEIC files")
     files = [file.absolute() for file in files]

@@ -65,7 +65,7 @@ def announcement(
         + (f", {seen.masks} of them with masks" if seen.masks else "")
         + (f", {held_out} of them held out" if held_out else "")
         + ("" if seen.has_cameras else ", without cameras")
-        + (f"; left out: {seen.left_out}." if seen.left_out else "."),
+        + (f"; skipped: {seen.skipped}." if seen.skipped else "."),
         ("Fits " if cameras_known else "Finds the cameras, then fits ")
         + f"at {width}x{height}: up to {settings.max_splats} splats, {settings.steps} steps.",
         f"Takes {'at most ' if rounds else ''}about {_duration(cameras + fit)} here"

@@ -26,7 +26,7 @@ from igsr.splats import Splats
 class FitInputs:
     """Everything that a fit depends on.
 
-    Captures, splats and priors are in the frame of the fit.
+    Captures, splats and priors are in the fit's frame.
 
     Attributes:
         frame: of the fit.

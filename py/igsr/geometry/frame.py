@@ -15,8 +15,8 @@ from igsr.splats import Splats
 
 Float64 = npt.NDArray[np.float64]
 
-#: Extent of cameras, and radius of splats, in the frame: those of usual captures, for which the
-#: lengths in fits (near plane, noise and pull of MCMC) were chosen.
+#: Extent of the cameras, and radius of the splats, in the frame. Usual captures have this extent, and
+#: constants of fits (near plane, noise and scale regularizer of MCMC) were chosen for it.
 EXTENT = 5.0
 #: Cameras nearer to each other than this, as a fraction of the distance to the scene, are at one
 #: place.
