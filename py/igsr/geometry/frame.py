@@ -15,8 +15,8 @@ from igsr.splats import Splats
 
 Float64 = npt.NDArray[np.float64]
 
-#: Extent of the cameras, and radius of the splats, in the frame. Usual captures have this extent, and
-#: constants of fits (near plane, noise and scale regularizer of MCMC) were chosen for it.
+#: Extent of the cameras, and radius of the splats, in the frame. Usual captures have this extent,
+#: for which constants of fits (near plane, noise and scale regularizer of MCMC) were chosen.
 EXTENT = 5.0
 #: Cameras nearer to each other than this, as a fraction of the distance to the scene, are at one
 #: place.
