@@ -262,3 +262,43 @@ def test_a_kept_mask_counts_in_the_first_sentence(igsr_here, tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert "Found 4 photos of 24x24, 4 of them with masks" in done.stdout + done.stderr
+
+
+def write_model(folder, names, count=None):
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "cameras.txt").write_text("1 SIMPLE_PINHOLE 32 24 30 16 12\n")
+    lines = [f"{i + 1} 1 0 0 0 {i} 0 0 1 {name}\n\n" for i, name in enumerate(names[:count])]
+    (folder / "images.txt").write_text("".join(lines))
+    (folder / "points3D.txt").write_text("")
+
+
+@pytest.mark.parametrize(
+    ("there", "named"),
+    [
+        ("images/A plan (0).png", "A plan (0).png"),
+        ("images/IMG_0.PNG", "img_0.png"),
+        ("images/0.png", "0.jpg"),
+        ("images/0.png", "images/0.png"),
+        ("images/0.png", "C:/Users/me/scan/images/0.png"),
+        ("images/a/0.png", "/home/me/images/a/0.png"),
+        ("images/DCIM/0.png", "0.png"),
+        ("input/0.png", "0.png"),
+    ],
+)
+def test_names_in_colmap_models(tmp_path, there, named):
+    photo(tmp_path / there)
+    photo(tmp_path / there.replace("0", "1"), 1)
+    write_model(tmp_path / "sparse" / "0", [named, named.replace("0", "1")])
+    capture = igsr.load_capture(tmp_path)
+    random = np.random.default_rng(0)
+    assert np.array_equal(capture.views[0].image, random.integers(0, 255, (24, 32, 3), np.uint8))
+    assert len(capture.views) == 2
+
+
+def test_the_model_with_the_most_images_is_read(tmp_path):
+    photos(tmp_path / "images", 5)
+    names = [f"{i}.png" for i in range(5)]
+    write_model(tmp_path / "sparse" / "0", names, 2)
+    write_model(tmp_path / "sparse" / "1", names)
+    with pytest.warns(UserWarning, match=r"sparse has 2 models; 1, with the most images, is used"):
+        assert len(igsr.load_capture(tmp_path).views) == 5

@@ -132,6 +132,29 @@ def test_blocks(scale, tmp_path):
     assert scores[1] == pytest.approx(scores[0], abs=0.1)
 
 
+@pytest.mark.parametrize("density", ["original", "mcmc"])
+def test_a_camera_far_outside_changes_little(density):
+    capture = room()
+    # Of six cameras and more, single ones do not count.
+    more = [replace(capture.views[k], name=f"again-{k}.png") for k in (1, 2)]
+    capture = igsr.Capture(capture.path, [*capture.views, *more], capture.points)
+    views = list(capture.views)
+    far = views[-1].camera.viewmat.copy()
+    far[:3, 3] += [5000.0, 0.0, 0.0]
+    views[-1] = replace(views[-1], camera=replace(views[-1].camera, viewmat=far))
+    assert sum(view.split == "train" for view in views) == 6
+    wrong = igsr.Capture(capture.path, views, capture.points)
+    scores = [
+        igsr.evaluate(
+            fit_capture(one, density=density, steps=120, max_splats=600, backend="cpu").splats,
+            capture,
+            "test",
+        ).psnr
+        for one in (capture, wrong)
+    ]
+    assert scores[1] > scores[0] - 1.0
+
+
 def test_rasterization_keeps_the_near_plane_of_gsplat():
     scene = scenes.torch_scene()
     near = scenes.rasterized(scene)[0]

@@ -366,6 +366,9 @@ def splat_extent(
 ) -> tuple[tuple[float, float, float], float, float]:
     """Center of visible splats, their radius, and the near plane of renders."""
 
+def camera_extent(centers: Float64) -> float:
+    """1.1 times the largest distance from the mean center, without outliers."""
+
 def morton_order(points: Float32) -> npt.NDArray[np.int64]:
     """Ids of points [N, 3] along Morton's curve, as the writers order splats."""
 

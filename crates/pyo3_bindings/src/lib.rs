@@ -67,7 +67,9 @@ mod _core {
     #[pymodule_export]
     use crate::level_files::{read_level, write_levels};
     #[pymodule_export]
-    use crate::splat_files::{morton_order, read_splats, splat_extent, write_splats};
+    use crate::splat_files::{
+        camera_extent, morton_order, read_splats, splat_extent, write_splats,
+    };
     #[pymodule_export]
     use crate::stages::{project, project_backward, rasterize, rasterize_backward};
     #[pymodule_export]

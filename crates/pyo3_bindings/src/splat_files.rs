@@ -6,7 +6,7 @@ use numpy::{IntoPyArray, PyArray1};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use splat_render::extent::{extent, near_plane};
+use splat_render::extent;
 use splat_render::io::SplatFile;
 
 use crate::arrays::{array, elements, row, rows, shaped};
@@ -55,8 +55,16 @@ pub fn splat_extent(
     let means = rows::<f32, 3>("means", &means, &[-1])?;
     let opacities = array::<f32>("opacities", opacities)?;
     let opacities = elements("opacities", &opacities, &[means.len() as isize])?;
-    let (center, radius) = py.detach(|| extent(means, opacities));
-    Ok((center.to_array(), radius, near_plane(radius)))
+    let (center, radius) = py.detach(|| extent::extent(means, opacities));
+    Ok((center.to_array(), radius, extent::near_plane(radius)))
+}
+
+/// The extent of cameras by their centers, N x 3; 0 if they coincide.
+#[pyfunction]
+pub fn camera_extent(centers: &Bound<'_, PyAny>) -> PyResult<f64> {
+    let centers = array::<f64>("centers", centers)?;
+    let centers = rows::<f64, 3>("centers", &centers, &[-1])?;
+    Ok(extent::camera_extent(&centers.iter().map(|&c| c.into()).collect::<Vec<_>>()))
 }
 
 /// Ids of points, N x 3, along Morton's curve, as the writers order splats.

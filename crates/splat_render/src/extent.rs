@@ -9,6 +9,12 @@ const SAMPLES: usize = 20_000;
 /// Near plane of renders, as a fraction of the scene's radius; about the near plane of fits.
 const NEAR_PART: f64 = 0.002;
 
+/// Minimum number of cameras to tell outliers.
+const OUTLIERS_FROM: usize = 6;
+/// Fraction of the cameras that are no outliers, and the largest distance of others in theirs.
+const NEAR_CAMERAS: f64 = 0.85;
+const FARTHEST: f64 = 4.0;
+
 /// Center of the visible splats, relative to their origin, and the radius with 90 % of them, at most four
 /// times the radius with 50 %. Medians, because captures have a few splats very far out.
 pub fn extent(means: &[[f32; 3]], opacities: &[f32]) -> (DVec3, f64) {
@@ -27,6 +33,21 @@ pub fn extent(means: &[[f32; 3]], opacities: &[f32]) -> (DVec3, f64) {
     let mut distances: Vec<f64> = seen.iter().map(|&i| at(i).distance(center)).collect();
     let radius = quantile(&mut distances, 0.9).min(4.0 * quantile(&mut distances, 0.5));
     (center, if radius > 0.0 { radius } else { 1.0 })
+}
+
+/// 1.1 times the largest distance of a camera's center from the mean center (3DGS). Of six cameras or
+/// more, a few far ones do not count: structure from motion can place single cameras anywhere.
+pub fn camera_extent(centers: &[DVec3]) -> f64 {
+    let mean = centers.iter().sum::<DVec3>() / centers.len().max(1) as f64;
+    let radius = centers.iter().map(|center| center.distance(mean)).fold(0.0, f64::max);
+    if centers.len() < OUTLIERS_FROM {
+        return 1.1 * radius;
+    }
+    let middle =
+        |axis: usize| quantile(&mut centers.iter().map(|c| c[axis]).collect::<Vec<_>>(), 0.5);
+    let center = DVec3::new(middle(0), middle(1), middle(2));
+    let mut distances: Vec<f64> = centers.iter().map(|c| c.distance(center)).collect();
+    1.1 * radius.min(FARTHEST * quantile(&mut distances, NEAR_CAMERAS))
 }
 
 /// Near plane of renders, which do not depend on the scene's unit.

@@ -103,6 +103,17 @@ def read_images(path: Path) -> list[ColmapImage]:
     return _text_images(path) if path.suffix == ".txt" else _binary_images(path)
 
 
+def image_count(folder: Path) -> int:
+    """The number of images of the model in a folder; 0 if it cannot be read."""
+    try:
+        if (folder / "images.bin").is_file():
+            with open(folder / "images.bin", "rb") as file:
+                return int(COUNT.unpack(file.read(COUNT.size))[0])
+        return sum(1 for _, line in _lines(folder / "images.txt", keep_empty=True)) // 2
+    except (OSError, struct.error, IgsrError):
+        return 0
+
+
 def read_points(path: Path) -> np.ndarray:
     """Read ``points3D.bin`` or ``points3D.txt``: [P] of ``_POINT_ROW``; a missing error is NaN."""
     rows = _text_points(path) if path.suffix == ".txt" else _binary_points(path)

@@ -65,7 +65,7 @@ class MaskFiles:
         for end in _MASK_ENDS:
             if relative.lower().endswith(end):
                 relative = relative[: -len(end)]
-        self._files[relative] = path
+        self._files[relative.lower()] = path
 
     def of(self, name: str) -> Path | None:
         """The mask of a photo.
@@ -74,7 +74,7 @@ class MaskFiles:
             name: posix path relative to the folder of photos.
         """
         stem = PurePosixPath(name).with_suffix("").as_posix()
-        return self._files.get(name) or self._files.get(stem)
+        return self._files.get(name.lower()) or self._files.get(stem.lower())
 
     def __bool__(self) -> bool:
         return bool(self._files)

@@ -27,6 +27,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from igsr._internal.rotations import rotations_of
+from igsr._internal.user_warning import warn_user
 from igsr.capture import colmap_files
 from igsr.capture.colmap_files import ColmapCamera, ColmapImage
 from igsr.capture.image_files import DEPTHS, SUFFIXES, find_depth, is_file
@@ -45,11 +46,19 @@ _REDUCED_FOLDER = re.compile(r"images_([1-9][0-9]{0,2})")
 
 
 def find_model(path: Path) -> Path | None:
-    """Return the folder of a capture's model: ``sparse/0``, ``sparse``, the capture, or None."""
-    for folder in (path / "sparse" / "0", path / "sparse", path):
-        if any(is_file(folder / f"cameras.{kind}") for kind in ("bin", "txt")):
-            return folder
-    return None
+    """Return the folder of a capture's model, or None.
+
+    It is the one of ``sparse/0``, ``sparse/1`` ... with the most images, else ``sparse`` or the
+    capture itself.
+    """
+    numbered = [folder for folder in (path / "sparse").glob("[0-9]*") if _is_model(folder)]
+    if numbered:
+        return min(numbered, key=lambda folder: (-colmap_files.image_count(folder), folder.name))
+    return next(filter(_is_model, (path / "sparse", path)), None)
+
+
+def _is_model(folder: Path) -> bool:
+    return any(is_file(folder / f"cameras.{kind}") for kind in ("bin", "txt"))
 
 
 def reduction_of(folder: str) -> int | None:
@@ -84,9 +93,13 @@ def describe_colmap(
         )
     cameras = colmap_files.read_cameras(cameras_path)
     images = colmap_files.read_images(images_path)
-    # Models made on Windows have backslashes in names.
-    images = [replace(image, name=image.name.replace("\\", "/")) for image in images]
+    images = [replace(image, name=_relative_name(image.name, path)) for image in images]
     images.sort(key=lambda image: image.name)
+    others = [folder for folder in model.parent.glob("[0-9]*") if _is_model(folder)]
+    if len(others) > 1:
+        warn_user(
+            f"{model.parent} has {len(others)} models; {model.name}, with the most images, is used."
+        )
     if not images:
         raise IgsrError(f"{images_path} lists no images; give a model with registered images")
     for image in images:
@@ -282,9 +295,9 @@ def _find_photos(
     except OSError:
         entries = {}
     folders = {factor: entry for factor, entry in entries.items() if factor and entry.is_dir()}
-    full: Path | None = capture / "images"
-    if not (capture / "images").is_dir():
-        full = None if folders else capture
+    full = next(filter(Path.is_dir, (capture / "images", capture / "input")), None)
+    if full is None and not folders:
+        full = capture
     if folder is not None:
         factors = [reduction_of(folder) or 1]
         folders = {factors[0]: capture / folder}
@@ -318,13 +331,16 @@ def _photos_in(
     files = [folder / name for name in names]
     if all(map(is_file, files)):
         return files
+    # Other programs change case and suffix, and leave out folders.
+    reduced = _sorted_photos(folder)
+    for key in (_stem, _base):
+        by_key = {key(path.relative_to(folder).as_posix()): path for path in reduced}
+        keys = list(map(key, names))
+        is_unique = len(by_key) == len(reduced) and len(set(keys)) == len(keys)
+        if is_unique and by_key.keys() >= set(keys):
+            return [by_key[key] for key in keys]
     if same_names:
         return None
-    reduced = _sorted_photos(folder)
-    by_stem = {path.relative_to(folder).with_suffix("").as_posix(): path for path in reduced}
-    stems = [PurePosixPath(name).with_suffix("").as_posix() for name in names]
-    if len(by_stem) == len(reduced) and by_stem.keys() >= set(stems):
-        return [by_stem[stem] for stem in stems]
     # LLFF gives its reduced photos new names, in the order of the full ones.
     full_photos = [] if full is None else _sorted_photos(full)
     if full is None or len(full_photos) != len(reduced):
@@ -332,6 +348,27 @@ def _photos_in(
     full_names = [path.relative_to(full).as_posix() for path in full_photos]
     by_name = dict(zip(full_names, reduced, strict=True))
     return [by_name[name] for name in names] if by_name.keys() >= set(names) else None
+
+
+def _stem(name: str) -> str:
+    return PurePosixPath(name).with_suffix("").as_posix().lower()
+
+
+def _base(name: str) -> str:
+    return PurePosixPath(_stem(name)).name
+
+
+def _relative_name(name: str, capture: Path) -> str:
+    """The name of a photo relative to the folder of photos.
+
+    Models made on Windows have backslashes; some have absolute names, or names from the capture on.
+    """
+    name = name.replace("\\", "/")
+    if re.match("([A-Za-z]:)?/", name):
+        name = name.rsplit("/images/", 1)[-1] if "/images/" in name else posixpath.basename(name)
+    elif name.startswith("images/") and not (capture / "images" / "images").is_dir():
+        name = name.removeprefix("images/")
+    return name
 
 
 def _sorted_photos(folder: Path) -> list[Path]:

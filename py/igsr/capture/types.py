@@ -10,6 +10,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from igsr import _core
 from igsr._internal.array_equality import ArrayEquality
 from igsr._internal.choices import Split
 from igsr._internal.notebook import NotebookPicture, numbers
@@ -416,12 +417,11 @@ class Capture(ArrayEquality, NotebookPicture):
     def scene_extent(self) -> float:
         """1.1 times the largest distance of a training camera from ``scene_center``, world units.
 
-        3DGS scales its learning rates and thresholds by this length (Kerbl et al. 2023). It is 1
-        if all cameras are at the same place, since 0 would freeze every fit.
+        3DGS scales its learning rates and thresholds by this length (Kerbl et al. 2023). Of six
+        cameras or more, single ones that are much farther than the others do not count. It is 1 if
+        all cameras are at the same place, since 0 would freeze every fit.
         """
-        offsets = self._camera_centers() - self.scene_center
-        extent = 1.1 * float(np.linalg.norm(offsets, axis=1).max())
-        return extent if extent > 0.0 else 1.0
+        return _core.camera_extent(self._camera_centers()) or 1.0
 
 
 def check_holdout(every: object, photos: int, path: Path) -> None:

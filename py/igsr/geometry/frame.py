@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from igsr import _core
 from igsr.capture import Camera, Capture, Points, View
 from igsr.errors import IgsrError
 from igsr.splats import Splats
@@ -44,10 +45,10 @@ class Frame:
         Raises:
             IgsrError: the cameras are too far apart for float32.
         """
-        cameras = [view.camera for view in capture.train_views]
-        centers = np.stack([camera.center for camera in cameras])
-        origin = np.asarray(centers.mean(axis=0))
-        extent = 1.1 * float(np.linalg.norm(centers - origin, axis=1).max())
+        centers = np.stack([view.camera.center for view in capture.train_views])
+        # An outlier moves the mean far from the scene.
+        origin = np.asarray(np.median(centers, axis=0))
+        extent = _core.camera_extent(centers)
         distance = _distance(capture, origin)
         if extent > MAX_EXTENT:
             raise IgsrError(

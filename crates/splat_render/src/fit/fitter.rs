@@ -16,6 +16,7 @@ use super::density;
 use super::exposures::{ExposureState, Exposures};
 use crate::camera::Camera;
 use crate::error::{Error, Result};
+use crate::extent::camera_extent;
 use crate::fit_device::{FitDevice, FitState, McmcRun, OriginalRun, StepInput};
 use crate::stages::Exposure;
 use crate::target::Target;
@@ -65,12 +66,10 @@ pub struct Fitter {
     step: u32,
 }
 
-/// 1.1 times the largest distance of a camera's center from the mean center (3DGS); 1 if all centers
-/// coincide.
-pub fn scene_extent(cameras: &[Camera]) -> f64 {
-    let mean = cameras.iter().map(Camera::center).sum::<glam::DVec3>() / cameras.len() as f64;
-    let radius = cameras.iter().map(|c| (c.center() - mean).length()).fold(0.0, f64::max);
-    if radius > 1e-9 { 1.1 * radius } else { 1.0 }
+/// The extent of cameras; 1 if all centers coincide.
+fn scene_extent(cameras: &[Camera]) -> f64 {
+    let extent = camera_extent(&cameras.iter().map(Camera::center).collect::<Vec<_>>());
+    if extent > 1e-9 { extent } else { 1.0 }
 }
 
 impl Fitter {

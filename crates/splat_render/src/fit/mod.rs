@@ -13,7 +13,7 @@ pub use cameras::{CameraConfig, CameraState, Cameras, Focal, PosePrior, scene_di
 pub use config::{Background, DensityControl, FitConfig};
 pub use depth_maps::{DepthMap, GrayPhoto, Search, depth_maps};
 pub use exposures::{ExposureState, Exposures};
-pub use fitter::{Fitter, scene_extent};
+pub use fitter::Fitter;
 pub use initial::splats_from_points;
 
 pub use crate::constants::{ADAM, SSIM_C, SSIM_WINDOW};
