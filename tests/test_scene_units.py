@@ -70,6 +70,16 @@ def test_fits(scale, shift, options):
     assert scores[0][0] > 12.5
 
 
+def test_fits_on_the_gpu():
+    capture = room()
+    options = {"density": "mcmc", "steps": 40, "max_splats": 400, "backend": "gpu"}
+    scores = [
+        igsr.evaluate(fit_capture(one, **options).splats, one, "train").psnr
+        for one in (capture, world(1e-4).capture(capture))
+    ]
+    assert scores[1] == pytest.approx(scores[0], abs=0.01)
+
+
 @pytest.mark.parametrize("backend", ["cpu", "gpu"])
 @pytest.mark.parametrize(("scale", "shift"), [*WORLDS, (1.0, 5e5)])
 def test_renders(scale, shift, backend):
