@@ -90,7 +90,7 @@ def test_masks_of_other_names_are_reported(tmp_path):
     photos(tmp_path)
     (tmp_path / "masks").mkdir()
     Image.fromarray(MASK).save(tmp_path / "masks" / "other.png")
-    with pytest.warns(UserWarning, match=r"No mask in .*masks has the name of a photo \(other.png"):
+    with pytest.warns(UserWarning, match=r"No mask in .*masks has the name of a photo, so"):
         read_photos(tmp_path)
 
 
@@ -150,30 +150,56 @@ def test_what_igsr_wrote_is_no_photo(tmp_path):
     before = find_photo_files(tmp_path).files
     out = tmp_path / "out"
     photo(out / "view" / "held-out" / "0.png")
+    photo(out / "rounds" / "1" / "view-0.after.png", 8)
     photo(out / "views.png", 7)
     (out / "scene.ply").write_bytes(b"")
     assert find_photo_files(tmp_path).files == before
-    assert found(tmp_path)[1] == "2 written by igsr"
+    assert found(tmp_path)[1] == "3 written by igsr"
+    with pytest.raises(IgsrError, match="holds no photos besides 3 written by igsr"):
+        find_photo_files(out)
+    # The output of a run in the folder of its photos.
+    for path in out.iterdir():
+        path.rename(tmp_path / path.name)
+    assert find_photo_files(tmp_path).files == before
 
 
-def test_what_igsr_rendered_is_no_photo(igsr_here, tmp_path):
-    capture = scenes.capture(views=3, size=24)
+def test_captures_in_the_folder_are_no_photos(tmp_path):
+    photos(tmp_path)
+    scenes.write_capture(tmp_path / "found", scenes.capture(views=3, size=24))
+    photos(tmp_path / "workspace" / "images")
+    (tmp_path / "workspace" / "sparse").mkdir()
+    expected = ["0.png", "1.png", "2.png"]
+    assert found(tmp_path) == (expected, "3 in the capture found/, 3 in the capture workspace/")
+    # A scene of others beside photos does not make them renders.
+    photos(tmp_path / "a")
+    (tmp_path / "a" / "scene.ply").write_bytes(b"")
+    assert [name for name in found(tmp_path)[0] if name.startswith("a/")]
+
+
+@pytest.mark.parametrize("place", [".", "images"])
+def test_what_igsr_rendered_is_no_photo(igsr_here, tmp_path, place):
+    capture = scenes.capture(views=4, size=24)
     scenes.write_capture(tmp_path / "capture", capture)
     scenes.splats().save(tmp_path / "scene.ply")
     folder = photos(tmp_path / "photos")
-    for words in (
-        ["--cameras", tmp_path / "capture", "--out", folder],
-        ["--cameras", tmp_path / "capture", "--orbit", 4, "--out", folder / "orbit.mp4"],
-    ):
-        done = igsr_here("render", tmp_path / "scene.ply", *words, "--backend", "cpu")
+    (folder / place).mkdir(exist_ok=True)
+    video = folder / "orbit.mp4"
+    cameras = ["--cameras", tmp_path / "capture", "--backend", "cpu", "--out"]
+    for words in ([*cameras, folder / place], ["--orbit", 4, *cameras, video]):
+        done = igsr_here("render", tmp_path / "scene.ply", *words)
         assert done.returncode == 0, done.stderr
-    names, skipped = found(folder)
-    assert [name for name in names if "/" not in name] == ["0.png", "1.png", "2.png"]
-    assert "rendered by igsr" in skipped
+    assert sum(path.is_file() for path in folder.rglob("*")) == 3 + 5
+    assert found(folder) == (["0.png", "1.png", "2.png"], "5 rendered by igsr")
     # A folder of renders only can be fitted.
     for name in "012":
         (folder / f"{name}.png").unlink()
-    assert len(find_photo_files(folder).files) >= 3
+    assert find_photo_files(folder).files
+
+
+def test_one_picture_beside_a_video_is_its_title(tmp_path):
+    photo(tmp_path / "scan.png")
+    (tmp_path / "scan.mp4").write_bytes(b"")
+    assert found(tmp_path) == (["scan.mp4", "scan.png"], "")
 
 
 def test_links_to_folders_are_followed_once(tmp_path):
@@ -212,8 +238,10 @@ def test_raw_photos_are_named(tmp_path):
     assert found(tmp_path)[1] == "1 .dng (export them as JPEG)"
     for index in range(3):
         (tmp_path / f"{index}.png").unlink()
-    with pytest.raises(IgsrError, match=r"holds no photos besides 1 \.dng \(export them as JPEG\)"):
-        find_photo_files(tmp_path)
+    message = r"holds no photos besides 1 \.dng \(export them as JPEG\)"
+    for read in (find_photo_files, look_at):
+        with pytest.raises(IgsrError, match=message):
+            read(tmp_path)
 
 
 def test_paths_from_windows(tmp_path):
@@ -302,3 +330,55 @@ def test_the_model_with_the_most_images_is_read(tmp_path):
     write_model(tmp_path / "sparse" / "1", names)
     with pytest.warns(UserWarning, match=r"sparse has 2 models; 1, with the most images, is used"):
         assert len(igsr.load_capture(tmp_path).views) == 5
+
+
+@pytest.mark.parametrize(
+    ("photo_name", "mask_name"),
+    [
+        ("../images/{}.png", "../masks/{}.png"),
+        ("{}.png", "masks/{}.png"),
+        ("a/{}.png", "masks/a/{}.png"),
+        ("a/{}.png", "a/masks/{}.png"),
+        ("a/b/{}.png", "a/mask/b/{}.jpg.png"),
+    ],
+)
+def test_masks_of_transforms_by_name(tmp_path, photo_name, mask_name):
+    folder = tmp_path / "capture"
+    folder.mkdir()
+    frames = []
+    for number in range(2):
+        photo(folder / photo_name.format(number), number)
+        mask = folder / mask_name.format(number)
+        mask.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(MASK).save(mask)
+        name = photo_name.format(number)
+        frames.append({"file_path": name, "transform_matrix": np.eye(4).tolist()})
+    text = {"fl_x": 30.0, "w": 32, "h": 24, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(text))
+    masks = [view.mask for view in igsr.load_capture(folder).views]
+    if "jpg" in mask_name:  # of another photo
+        assert masks == [None, None]
+    else:
+        assert all(np.array_equal(mask, MASK > 0) for mask in masks)
+
+
+@pytest.mark.parametrize("name", ["images/", "/", "."])
+def test_images_without_a_name_are_refused(tmp_path, name):
+    photos(tmp_path / "images", 2)
+    write_model(tmp_path / "sparse" / "0", [name])
+    with pytest.raises(IgsrError, match="image 1 has no name"):
+        igsr.load_capture(tmp_path)
+
+
+def test_photos_of_another_folder_are_not_taken(tmp_path):
+    photos(tmp_path / "images" / "b", 2)
+    write_model(tmp_path / "sparse" / "0", ["a/0.png", "a/1.png"])
+    with pytest.raises(IgsrError, match=r"a/0\.png is missing"):
+        igsr.load_capture(tmp_path)
+
+
+def test_absolute_names_of_files_that_exist(tmp_path):
+    elsewhere = photos(tmp_path / "elsewhere", 2)
+    capture = tmp_path / "capture"
+    write_model(capture / "sparse" / "0", [str(elsewhere / f"{i}.png") for i in range(2)])
+    assert len(igsr.load_capture(capture).views) == 2

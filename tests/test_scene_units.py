@@ -1,5 +1,6 @@
 """The unit and the origin of the world change nothing in fits, scores and renders."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -163,6 +164,72 @@ def test_a_camera_far_outside_changes_little(density):
         for one in (capture, wrong)
     ]
     assert scores[1] > scores[0] - 1.0
+
+
+@pytest.mark.parametrize("shift", [0.0, 7.3, 1e3, 5e5])
+def test_cameras_at_one_place(shift):
+    """A panorama: rotations without points, wherever the tripod is."""
+    views = []
+    for number, angle in enumerate(np.linspace(-0.4, 0.4, 5)):
+        viewmat = rooms.camera(0.0, 60.0, 72, 54).viewmat
+        turn = np.array(
+            [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+        )
+        center = -viewmat[:3, :3].T @ viewmat[:3, 3]
+        turned = np.eye(4)
+        turned[:3, :3] = turn @ viewmat[:3, :3]
+        turned[:3, 3] = -turned[:3, :3] @ center
+        camera = replace(rooms.camera(0.0, 60.0, 72, 54), viewmat=turned)
+        views.append(View(f"{number}.png", camera, "train", rooms.picture(camera)))
+    capture = igsr.Capture("panorama", views)
+    options = {"steps": 60, "max_splats": 600, "backend": "cpu", "start": "rays"}
+    scores = []
+    for one in (capture, world(1.0, shift).capture(capture)):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            fitted = fit_capture(one, **options)
+        scores.append(igsr.evaluate(fitted.splats, one, "train").psnr)
+    assert scores[1] == pytest.approx(scores[0], abs=0.5)
+
+
+def test_near_things_before_a_far_background_are_drawn():
+    near, far = scenes.splats(count=60, degree=0), scenes.splats(count=300, degree=0, seed=1)
+    near = replace(near, means=near.means * 0.3 + np.float32([0, 0, 0.5]), scales=near.scales - 2)
+    far = replace(far, means=far.means * 100 + np.float32([0, 0, 300]), scales=far.scales + 6)
+    both = joined([near, far])
+    capture = scenes.capture(views=3)
+    views = [
+        replace(view, camera=Frame(np.array([0.0, 0.0, -k]), 1.0).camera(_looking(view.camera)))
+        for k, view in zip((0.0, 0.05, 0.1), capture.views, strict=True)
+    ]
+    views = [replace(v, image=igsr.render(both, v.camera, backend="cpu").to_uint8()) for v in views]
+    seen = igsr.render(both, views[0].camera, backend="cpu")
+    assert (seen.expected_depth[seen.alpha > 0.5] < 2.0).any()
+    window = igsr.Capture("window", views)
+    kept = [
+        int((igsr.remove_floaters(one, window, backend="cpu").splats.means[:, 2] < 2.0).sum())
+        for one in (near, both)
+    ]
+    assert kept[1] > 0.8 * kept[0]
+
+
+def _looking(camera):
+    return replace(camera, viewmat=np.eye(4))
+
+
+@pytest.mark.parametrize("jitter", [0.0, 1e-3, 1e-4])
+def test_many_photos_from_one_spot(jitter):
+    capture, random = room(), np.random.default_rng(0)
+    views = list(capture.views)
+    for number in range(30):
+        viewmat = views[1].camera.viewmat.copy()
+        viewmat[:3, 3] += jitter * random.normal(size=3)
+        camera = replace(views[1].camera, viewmat=viewmat)
+        views.append(replace(views[1], name=f"still-{number}.png", camera=camera))
+    still = igsr.Capture(capture.path, views, capture.points)
+    options = {"density": "mcmc", "steps": 120, "max_splats": 600, "backend": "cpu"}
+    fitted = fit_capture(still, **options).splats
+    assert igsr.evaluate(fitted, capture, "test").psnr > 11.0
 
 
 def test_rasterization_keeps_the_near_plane_of_gsplat():

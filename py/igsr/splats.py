@@ -173,7 +173,7 @@ class Splats(ArrayEquality, NotebookPicture):
         Returns:
             The median of the visible splats, float64 [3], relative to ``origin``; the radius that
             contains 90 % of them, at most four times the radius that contains 50 %; and the
-            distance in front of a camera from which splats are drawn, a 500th of the radius.
+            distance in front of a camera from which splats are drawn, 10^-4 radii.
         """
         count = len(self) - self.backdrop_splats
         arrays = (np.ascontiguousarray(array[:count]) for array in (self.means, self.opacities))

@@ -6,13 +6,15 @@ use glam::DVec3;
 const FAINT_LOGIT: f32 = -2.2;
 /// Number of splats that the extent is computed from.
 const SAMPLES: usize = 20_000;
-/// Near plane of renders, as a fraction of the scene's radius; about the near plane of fits.
-const NEAR_PART: f64 = 0.002;
+/// Near plane of renders, as a fraction of the scene's radius: small, because the radius of a room with
+/// a view is that of the view.
+const NEAR_PART: f64 = 1e-4;
 
 /// Minimum number of cameras to tell outliers.
 const OUTLIERS_FROM: usize = 6;
-/// Fraction of the cameras that are no outliers, and the largest distance of others in theirs.
-const NEAR_CAMERAS: f64 = 0.85;
+/// At least one camera, and at most one of so many, may be an outlier.
+const CAMERAS_PER_OUTLIER: usize = 20;
+/// The largest distance of outliers, in that of the farthest other camera.
 const FARTHEST: f64 = 4.0;
 
 /// Center of the visible splats, relative to their origin, and the radius with 90 % of them, at most four
@@ -47,7 +49,9 @@ pub fn camera_extent(centers: &[DVec3]) -> f64 {
         |axis: usize| quantile(&mut centers.iter().map(|c| c[axis]).collect::<Vec<_>>(), 0.5);
     let center = DVec3::new(middle(0), middle(1), middle(2));
     let mut distances: Vec<f64> = centers.iter().map(|c| c.distance(center)).collect();
-    1.1 * radius.min(FARTHEST * quantile(&mut distances, NEAR_CAMERAS))
+    distances.sort_unstable_by(f64::total_cmp);
+    let outliers = (centers.len() / CAMERAS_PER_OUTLIER).max(1);
+    1.1 * radius.min(FARTHEST * distances[centers.len() - 1 - outliers])
 }
 
 /// Near plane of renders, which do not depend on the scene's unit.

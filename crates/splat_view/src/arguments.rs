@@ -39,7 +39,7 @@ View:
   --orbit DEG          turn about the scene's center; with --frames: the number of pictures
   --up AXIS            up axis: x, y, z, -x, -y or -z; default: from the cameras, else estimated
   --fov DEG            vertical field of view, 5 to 150; default 50
-  --near DISTANCE      near plane; default a 500th of the scene's radius
+  --near DISTANCE      near plane; default a ten-thousandth of the scene's radius
   --background COLOR   white, black, gray or R,G,B in 0..1; default: the fit's, else black
 
   --help, --version";

@@ -11,6 +11,9 @@ pub fn write_png(path: &Path, [width, height]: [u32; 2], rgb: &[u8]) -> Result<(
         let mut encoder = png::Encoder::new(out, width, height);
         encoder.set_color(png::ColorType::Rgb);
         encoder.set_depth(png::BitDepth::Eight);
+        // By this, igsr does not take it for a photo.
+        let tag = encoder.add_text_chunk("Software".to_owned(), "igsr render".to_owned());
+        tag.map_err(std::io::Error::other)?;
         let mut writer = encoder.write_header().map_err(std::io::Error::other)?;
         writer.write_image_data(rgb).map_err(std::io::Error::other)?;
         writer.finish().map_err(std::io::Error::other)

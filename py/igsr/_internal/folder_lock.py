@@ -51,6 +51,7 @@ def _locked(path: Path) -> int | None:
         try:
             is_free = _try_lock(file)
             if is_free is None:
+                os.unlink(path)
                 os.close(file)
                 return None
             if not is_free:

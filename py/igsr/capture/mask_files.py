@@ -1,15 +1,15 @@
 """Find the masks of photos by their customary names.
 
-A folder of photos contains its masks in ``masks``, ``mask``, ``alpha`` or ``alphas``, or has that
-folder next to it. The mask of ``a/1.jpg`` is ``a/1.png``, ``a/1.jpg.png`` (COLMAP),
-``a/1_mask.png`` (Metashape) or ``a/1.jpg.mask.png`` (RealityScan), with any image suffix. The last
-two may also be in the folder of the photo. Pixels are used where the mask is white.
+Masks are in a folder ``masks``, ``mask``, ``alpha`` or ``alphas`` that is in the folder of the
+photo, next to it or further up. The mask of ``1.jpg`` is ``1.png``, ``1.jpg.png`` (COLMAP),
+``1_mask.png`` (Metashape) or ``1.jpg.mask.png`` (RealityScan), with any image suffix. The last two
+may also be in the folder of the photo. Pixels are used where the mask is white.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
 from igsr._internal.user_warning import warn_user
@@ -22,96 +22,113 @@ _MASK_ENDS = (".mask", "_mask")
 
 
 class MaskFiles:
-    """The masks in some folders, by the names of their photos."""
+    """Finds the masks of photos; folders are listed once."""
 
-    def __init__(self, folders: Iterable[Path], photos: Path | None = None) -> None:
-        """List the masks.
+    def __init__(self, top: Path, factor: int = 1) -> None:
+        """List no folder yet.
 
         Args:
-            folders: the folder of masks is the first that exists.
-            photos: the folder of photos, which may contain masks, too.
+            top: the highest folder that may hold a folder of masks.
+            factor: of the reduction of the photos; ``masks_K`` is preferred if it is K.
         """
-        self.folder = next((folder for folder in folders if folder.is_dir()), None)
-        self._files: dict[str, Path] = {}
-        if photos is not None:
-            for path in _images(photos):
-                if path.stem.lower().endswith(_MASK_ENDS):
-                    self._add(path, photos)
-        if self.folder is not None:
-            for path in _images(self.folder):
-                self._add(path, self.folder)
+        self._top = _absolute(top)
+        self._names = [f"masks_{factor}", *MASK_FOLDERS] if factor > 1 else [*MASK_FOLDERS]
+        self._folders: dict[Path, list[dict[str, Path]]] = {}
+        self._unused: Path | None = None
+        self._used = 0
 
     @classmethod
-    def beside(cls, photos: Path, factor: int = 1, capture: Path | None = None) -> MaskFiles:
-        """The masks of a folder of photos.
+    def of_photos(cls, root: Path) -> MaskFiles:
+        """For a folder of photos without cameras; ``images`` may have masks next to it."""
+        return cls(_absolute(root).parent if _is_images(_absolute(root)) else root)
 
-        Args:
-            photos: a folder ``images`` or ``images_K`` may have the folder of masks next to it.
-            factor: of the reduction of the photos; ``masks_K`` is preferred if it is K.
-            capture: another folder that may have the folder of masks.
-        """
-        places = [photos]
-        if capture is not None:
-            places.append(capture)
-        elif photos.resolve().name.lower().split("_")[0] == "images":
-            places.append(photos.resolve().parent)
-        names = [f"masks_{factor}"] if factor > 1 else []
-        folders = [place / name for place in places for name in names]
-        folders += [place / found for place in places for found in _mask_folders(place)]
-        return cls(folders, photos)
+    def of(self, photo: Path) -> Path | None:
+        """The mask of a photo, or None."""
+        mask = next(self._candidates(photo), None)
+        self._used += mask is not None
+        return mask
 
-    def _add(self, path: Path, root: Path) -> None:
-        relative = path.relative_to(root).with_suffix("").as_posix()
-        for end in _MASK_ENDS:
-            if relative.lower().endswith(end):
-                relative = relative[: -len(end)]
-        self._files[relative.lower()] = path
+    def _candidates(self, photo: Path) -> Iterator[Path]:
+        folder, inside = _absolute(photo).parent, [photo.name]
+        beside = self._indices(folder)[0]
+        yield from _named(beside, photo.name)
+        while True:
+            for index in self._indices(folder)[1:]:
+                for name in ("/".join(inside), "/".join(inside[1:])):
+                    if name:
+                        yield from _named(index, name)
+            is_inside = folder != self._top and folder.is_relative_to(self._top)
+            is_outside = not folder.is_relative_to(self._top)
+            if not is_inside and not (is_outside and _is_images(folder)):
+                return
+            folder, inside = folder.parent, [folder.name, *inside]
 
-    def of(self, name: str) -> Path | None:
-        """The mask of a photo.
+    def _indices(self, folder: Path) -> list[dict[str, Path]]:
+        """Masks beside photos of a folder, and of each of its folders of masks."""
+        if folder not in self._folders:
+            try:
+                entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
+            except OSError:
+                entries = []
+            beside = [Path(entry.path) for entry in entries if _is_mask_name(entry.name)]
+            found = {entry.name.lower(): Path(entry.path) for entry in entries if entry.is_dir()}
+            indices = [_index(folder, beside)]
+            for name in self._names:
+                if name in found:
+                    indices.append(_index(found[name], _images(found[name])))
+                    if indices[-1] and self._unused is None:
+                        self._unused = found[name]
+            self._folders[folder] = indices
+        return self._folders[folder]
 
-        Args:
-            name: posix path relative to the folder of photos.
-        """
-        stem = PurePosixPath(name).with_suffix("").as_posix()
-        return self._files.get(name.lower()) or self._files.get(stem.lower())
-
-    def __bool__(self) -> bool:
-        return bool(self._files)
-
-    def warn_unless_used(self, masks: int) -> None:
-        """Warn if there are masks, and none has the name of a photo.
-
-        Args:
-            masks: number of photos with a mask.
-        """
-        if self._files and not masks and self.folder is not None:
-            example = min(self._files.values()).name
+    def warn_unless_used(self) -> None:
+        """Warn if there are masks, and none has the name of a photo."""
+        if self._unused is not None and not self._used:
             warn_user(
-                f"No mask in {self.folder} has the name of a photo ({example}), so none is used: "
-                "name the mask of 1.jpg 1.png or 1.jpg.png."
+                f"No mask in {self._unused} has the name of a photo, so none is used: name the "
+                "mask of 1.jpg 1.png or 1.jpg.png."
             )
 
 
-def is_mask_beside(name: str, stems: set[str]) -> bool:
+def is_mask_beside(name: str, others: set[str]) -> bool:
     """Whether a file is the mask of a photo in the same folder.
 
     Args:
         name: of the file.
-        stems: of the files in the folder, and their names, in lower case.
+        others: names and stems of the files in the folder, in lower case.
     """
     stem = PurePosixPath(name).stem.lower()
-    return any(stem.endswith(end) and stem[: -len(end)] in stems for end in _MASK_ENDS)
+    return any(stem.endswith(end) and stem[: -len(end)] in others for end in _MASK_ENDS)
 
 
-def _mask_folders(place: Path) -> list[str]:
-    """Names of folders of masks in a folder."""
-    try:
-        names = sorted(entry.name for entry in os.scandir(place) if entry.is_dir())
-    except OSError:
-        return []
-    found = [name for name in names if name.lower() in MASK_FOLDERS]
-    return sorted(found, key=lambda name: MASK_FOLDERS.index(name.lower()))
+def _is_images(folder: Path) -> bool:
+    return folder.name.lower().split("_")[0] == "images"
+
+
+def _absolute(path: Path) -> Path:
+    """The path from the root on; links stay."""
+    return Path(os.path.abspath(path))
+
+
+def _is_mask_name(name: str) -> bool:
+    return name.lower().endswith(SUFFIXES) and PurePosixPath(name).stem.lower().endswith(_MASK_ENDS)
+
+
+def _index(root: Path, files: list[Path]) -> dict[str, Path]:
+    """Masks by the names of their photos relative to ``root``, in lower case, without suffix."""
+    index = {}
+    for path in files:
+        name = path.relative_to(root).with_suffix("").as_posix().lower()
+        for end in _MASK_ENDS:
+            name = name.removesuffix(end)
+        index[name] = path
+    return index
+
+
+def _named(index: dict[str, Path], name: str) -> Iterator[Path]:
+    for key in (name.lower(), PurePosixPath(name.lower()).with_suffix("").as_posix()):
+        if key in index:
+            yield index[key]
 
 
 def _images(folder: Path) -> list[Path]:

@@ -22,13 +22,19 @@ OTHER_FOLDERS = (
     *("depth", "depths", "depth_maps", "confidence", "confidences", "conf", "normal", "normals"),
     *("thumbnail", "thumbnails", "thumbs", "semantic", "semantics", "segmentation", "sparse"),
 )
-#: Files in the folders that igsr writes.
+#: Files in the folders that igsr writes, and the folders and pictures that it writes there.
 OWN_FILES = ("scene.ply", "checkpoint.npz", "cameras.npz", "view/run.json")
+OWN_FOLDERS = ("view", "rounds", "blocks", "checkpoints")
+OWN_PICTURES = ("views.png", "poses.png", "matches.png", "scene.compact.png")
+OWN = "written by igsr"
+#: Minimum number of photos to find cameras from.
+MIN_PHOTOS = 2
 #: Photos in formats that igsr does not read.
 UNREAD_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2", ".raf", ".jxl", ".jp2")
-#: In the images and videos that igsr renders, and the number of first and last bytes to search.
+#: In the images and videos that igsr renders: in their first bytes or, of videos, the last ones.
 OWN_TAG = "igsr render"
-TAG_BYTES = 1 << 16
+TAG_BYTES = 1 << 10
+VIDEO_TAG_BYTES = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -51,13 +57,9 @@ class PhotoFiles:
         """The skipped files in words, or an empty string."""
         return ", ".join(f"{count} {what}" for what, count in self.skipped.items())
 
-    def mask_of(self, file: Path) -> Path | None:
-        """The mask of one of the files."""
-        return self.masks.of(file.relative_to(self.root).as_posix())
-
     def mask_count(self) -> int:
         """Number of files with a mask."""
-        return sum(self.mask_of(file) is not None for file in self.files)
+        return sum(self.masks.of(file) is not None for file in self.files)
 
 
 def find_photo_files(path: Paths) -> PhotoFiles:
@@ -92,7 +94,7 @@ def has_photos(path: Path) -> bool:
     if is_file(path):
         return path.suffix.lower() in VIDEO_SUFFIXES
     try:
-        return path.is_dir() and any(place for place in _walk(path) if place.photos)
+        return path.is_dir() and any(True for _ in _walk(path))
     except (OSError, ValueError):
         return False
 
@@ -119,21 +121,26 @@ def _walk(root: Path) -> Iterator[_Place]:
             continue
         seen.add(real)
         other = others.pop(path, None)
+        is_run = any(is_file(path / file) for file in OWN_FILES)
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         for name in folders:
-            others[path / name] = other or _other_folder(path, name, folders)
+            is_own = is_run and name in OWN_FOLDERS
+            others[path / name] = other or (OWN if is_own else _other_folder(path, name, folders))
         visible = sorted(name for name in names if not name.startswith("."))
         photos = [name for name in visible if _is_photo(path / name)]
+        own = [name for name in photos if is_run and name in OWN_PICTURES]
         unread = [name for name in visible if name.lower().endswith(UNREAD_SUFFIXES)]
-        if photos or unread:
-            yield _Place(path, photos, unread, other)
+        if own:
+            yield _Place(path, own, [], OWN)
+        if len(photos) > len(own) or unread:
+            yield _Place(path, [name for name in photos if name not in own], unread, other)
 
 
 def _other_folder(path: Path, name: str, siblings: Sequence[str]) -> str | None:
     """The reason to skip a folder, or None."""
-    if any(is_file(path / name / file) for file in OWN_FILES):
-        return "written by igsr"
-    lower = [sibling.lower() for sibling in siblings]
+    folder, lower = path / name, [sibling.lower() for sibling in siblings]
+    if is_file(folder / "transforms.json") or (folder / "sparse").is_dir():
+        return f"in the capture {name}/"
     is_reduced = name.lower().startswith("images_") and name[7:].isdigit() and "images" in lower
     # Polycam's undistorted photos.
     is_raw = name.lower() == "images" and "corrected_images" in lower
@@ -146,58 +153,60 @@ def _is_photo(path: Path) -> bool:
 
 
 def _found(folder: Path) -> PhotoFiles:
-    """The photos of the scene in a folder. If all folders would be skipped, none is."""
+    """The photos of the scene in a folder. Folders are not skipped if all photos are in them."""
     places = list(_walk(folder))
-    scene = [place for place in places if place.other is None and place.photos] or places
     skipped: Counter[str] = Counter()
+    scene = [place for place in places if place.other is None and place.photos]
+    if not scene:
+        scene = [place for place in places if place.other != OWN]
     for place in places:
         if place not in scene and place.path.name.lower() not in MASK_FOLDERS:
             skipped[str(place.other)] += len(place.photos)
-    root = folder
-    inside = [place for place in scene if _is_in_images(place.path.relative_to(folder))]
-    direct = sum(len(place.photos) for place in scene if place.path == folder)
-    if sum(len(place.photos) for place in inside) > direct:
-        root = folder / inside[0].path.relative_to(folder).parts[0]
-        skipped["outside of images/"] += sum(len(place.photos) for place in scene)
-        skipped["outside of images/"] -= sum(len(place.photos) for place in inside)
-        scene = inside
     files = [file for place in scene for file in _of_scene(place, skipped)]
+    renders = set(filter(_is_render, files))
+    if len(renders) < len(files):
+        skipped["rendered by igsr"] += len(renders)
+        files = [file for file in files if file not in renders]
+    root = folder
+    first = [file.relative_to(folder).parts[0] for file in files]
+    images = Counter(name for name in first if name.lower() == "images").most_common(1)
+    if images and images[0][1] > sum(file.parent == folder for file in files):
+        root = folder / images[0][0]
+        inside = [file for file in files if root in file.parents]
+        skipped["outside of images/"] += len(files) - len(inside)
+        files = inside
     files.sort(key=lambda file: file.relative_to(root).as_posix())
     for suffix in sorted(Path(name).suffix.lower() for place in places for name in place.unread):
         skipped[f"{suffix} (export them as JPEG)"] += 1
-    return PhotoFiles(root, files, MaskFiles.beside(root), +skipped)
-
-
-def _is_in_images(place: Path) -> bool:
-    return bool(place.parts) and place.parts[0].lower() == "images"
+    return PhotoFiles(root, files, MaskFiles.of_photos(root), +skipped)
 
 
 def _of_scene(place: _Place, skipped: Counter[str]) -> Iterator[Path]:
-    """The photos in a folder, without masks, Live Photos' videos and igsr's renders."""
+    """The photos in a folder, without masks and the videos of Live Photos."""
     names = {name.lower() for name in place.photos}
     videos = [name for name in place.photos if name.lower().endswith(VIDEO_SUFFIXES)]
     stems = {Path(name).stem.lower() for name in place.photos if name not in videos}
-    renders = [name for name in place.photos if _is_render(place.path / name)]
     for name in place.photos:
         if is_mask_beside(name, names | stems):
             continue
-        if name in videos and Path(name).stem.lower() in stems:
+        # One picture beside a video is its title.
+        if name in videos and Path(name).stem.lower() in stems and len(stems) >= MIN_PHOTOS:
             skipped["videos named like photos"] += 1
-        elif name in renders and len(renders) < len(place.photos):
-            skipped["rendered by igsr"] += 1
         else:
             yield place.path / name
 
 
 def _is_render(file: Path) -> bool:
     """Whether igsr rendered an image or video."""
-    if file.suffix.lower() not in (".png", *VIDEO_SUFFIXES):
+    is_image = file.suffix.lower() == ".png"
+    if not is_image and file.suffix.lower() not in VIDEO_SUFFIXES:
         return False
     try:
         with open(file, "rb") as opened:
             ends = opened.read(TAG_BYTES)
-            opened.seek(max(0, file.stat().st_size - TAG_BYTES))
-            ends += opened.read(TAG_BYTES)
+            if not is_image:
+                opened.seek(max(0, file.stat().st_size - VIDEO_TAG_BYTES))
+                ends += opened.read(VIDEO_TAG_BYTES)
     except OSError:
         return False
     return OWN_TAG.encode() in ends
@@ -216,4 +225,4 @@ def _listed_files(files: list[Path]) -> PhotoFiles:
     if repeated:
         raise IgsrError(f"{repeated[0]} is given twice; give it once")
     root = Path(os.path.commonpath([file.parent for file in files]))
-    return PhotoFiles(root, files, MaskFiles.beside(root))
+    return PhotoFiles(root, files, MaskFiles.of_photos(root))

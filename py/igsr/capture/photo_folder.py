@@ -26,7 +26,7 @@ from igsr.capture.exif import TURNED, Exif, read_exif, turned_back, upright
 from igsr.capture.image_files import decoded, is_file, mask_of, open_image, photo_header
 from igsr.capture.mask_files import MaskFiles
 from igsr.capture.memory_check import PhotoSizes
-from igsr.capture.photo_files import Paths, find_photo_files
+from igsr.capture.photo_files import MIN_PHOTOS, Paths, find_photo_files
 from igsr.capture.read_transforms import read_lens
 from igsr.capture.rig import Rig, decoded_size, rig_of, sampled_views
 from igsr.capture.types import Camera
@@ -36,8 +36,6 @@ from igsr.errors import IgsrError
 
 #: Default maximum number of frames taken from each video.
 FRAMES = 100
-#: Minimum number of photos to find cameras from.
-MIN_PHOTOS = 2
 #: File in a folder of photos that describes their lens; see the module.
 LENS = "lens.json"
 
@@ -130,12 +128,12 @@ def read_photos(path: Paths, frames: int = FRAMES, max_size: int | None = None) 
     with warnings.catch_warnings():
         # Pillow warns of damaged EXIF and the like even if the pixels can be read.
         warnings.filterwarnings("ignore", module="PIL")
-        sizes = replace(_sizes_of(files, frames, lens), masked=bool(found.masks))
+        sizes = replace(_sizes_of(files, frames, lens), masked=found.mask_count() > 0)
         sizes.check_memory(max_size)
         with ThreadPoolExecutor(max_workers=sizes.decoding_threads(max_size)) as pool:
             results = list(pool.map(load, files))
     photos = [photo for result in results if isinstance(result, list) for photo in result]
-    found.masks.warn_unless_used(found.mask_count())
+    found.masks.warn_unless_used()
     errors = [result for result in results if isinstance(result, IgsrError)]
     if errors:
         if len(photos) < MIN_PHOTOS:
@@ -215,7 +213,7 @@ def _photos_of_file(
     file: Path, name: str, masks: MaskFiles, lens: WideFisheye | None, max_size: int | None
 ) -> list[Photo]:
     """A photo, or the views of a wide one."""
-    mask_path = masks.of(name)
+    mask_path = masks.of(file)
     with open_image(file) as image:
         full, exif = image.size, read_exif(image)
         mask = None

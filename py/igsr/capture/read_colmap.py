@@ -52,6 +52,8 @@ def find_model(path: Path) -> Path | None:
     capture itself.
     """
     numbered = [folder for folder in (path / "sparse").glob("[0-9]*") if _is_model(folder)]
+    if len(numbered) == 1:
+        return numbered[0]
     if numbered:
         return min(numbered, key=lambda folder: (-colmap_files.image_count(folder), folder.name))
     return next(filter(_is_model, (path / "sparse", path)), None)
@@ -94,9 +96,14 @@ def describe_colmap(
     cameras = colmap_files.read_cameras(cameras_path)
     images = colmap_files.read_images(images_path)
     images = [replace(image, name=_relative_name(image.name, path)) for image in images]
+    for image in images:
+        if not PurePosixPath(image.name).name:
+            raise IgsrError(
+                f"{images_path}: image {image.identity} has no name; export the model again"
+            )
     images.sort(key=lambda image: image.name)
-    others = [folder for folder in model.parent.glob("[0-9]*") if _is_model(folder)]
-    if len(others) > 1:
+    others = [folder for folder in (path / "sparse").glob("[0-9]*") if _is_model(folder)]
+    if len(others) > 1 and model in others:
         warn_user(
             f"{model.parent} has {len(others)} models; {model.name}, with the most images, is used."
         )
@@ -120,11 +127,11 @@ def describe_colmap(
         except IgsrError as error:
             raise IgsrError(f"{cameras_path}, camera {image.camera_id}: {error}") from error
         name = posixpath.normpath(posixpath.join(prefix, image.name))
-        mask = files.masks.of(image.name)
+        mask = files.masks.of(file)
         shot = Shot(name, file, camera, lens, "train", mask, images_path, files.factor)
-        shot = replace(shot, depth_path=find_depth(path / DEPTHS, image.name))
+        shot = replace(shot, depth_path=find_depth(path / DEPTHS, image.name.lstrip("/")))
         photos.append(_Photo(image, shot, rig))
-    files.masks.warn_unless_used(sum(photo.shot.mask_path is not None for photo in photos))
+    files.masks.warn_unless_used()
     frames = colmap_files.read_frames(frames_path) if is_file(frames_path) else []
     shared = _shared_centers(frames, [photo for photo in photos if photo.rig is None])
     shots = []
@@ -315,7 +322,7 @@ def _find_photos(
     for factor in factors:
         files = _photos_in(folders[factor], full, names, same_names=factor == 1)
         if files is not None:
-            return _PhotoFiles(files, factor, MaskFiles.beside(folders[factor], factor, capture))
+            return _PhotoFiles(files, factor, MaskFiles(capture, factor))
     required = folders[min(folders)]
     missing = next(name for name in names if not is_file(required / name))
     raise IgsrError(
@@ -337,7 +344,8 @@ def _photos_in(
         by_key = {key(path.relative_to(folder).as_posix()): path for path in reduced}
         keys = list(map(key, names))
         is_unique = len(by_key) == len(reduced) and len(set(keys)) == len(keys)
-        if is_unique and by_key.keys() >= set(keys):
+        is_flat = key is _stem or not any("/" in name for name in names)
+        if is_unique and is_flat and by_key.keys() >= set(keys):
             return [by_key[key] for key in keys]
     if same_names:
         return None
@@ -364,9 +372,17 @@ def _relative_name(name: str, capture: Path) -> str:
     Models made on Windows have backslashes; some have absolute names, or names from the capture on.
     """
     name = name.replace("\\", "/")
+    if is_file(Path(name)) and Path(name).is_absolute():
+        return name
     if re.match("([A-Za-z]:)?/", name):
-        name = name.rsplit("/images/", 1)[-1] if "/images/" in name else posixpath.basename(name)
-    elif name.startswith("images/") and not (capture / "images" / "images").is_dir():
+        # The longest end of the name that is a photo.
+        parts = name.split("/")
+        ends = ["/".join(parts[first:]) for first in range(1, len(parts))]
+        known = [capture / folder for folder in ("images", "input")]
+        photos = [folder for folder in known if folder.is_dir()] or [capture]
+        found = (end for end in ends if any(is_file(folder / end) for folder in photos))
+        return next(found, parts[-1])
+    if name.startswith("images/") and not (capture / "images" / "images").is_dir():
         name = name.removeprefix("images/")
     return name
 

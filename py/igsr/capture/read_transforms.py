@@ -63,17 +63,13 @@ def describe_transforms(path: Path) -> DescribedCapture:
 
 def _with_masks(shots: list[Shot], folder: Path) -> list[Shot]:
     """The photos with masks by their names, if the file names no mask."""
-    tops = {shot.name.split("/")[0] for shot in shots if "/" in shot.name}
-    if len(tops) != 1 or any(shot.mask_path is not None for shot in shots):
+    if any(shot.mask_path is not None for shot in shots):
         return shots
-    photos = folder / tops.pop()
-    masks = MaskFiles.beside(photos, capture=folder)
-    found = []
+    masks, found = MaskFiles(folder), []
     for shot in shots:
-        is_inside = shot.rig is None and shot.path.is_relative_to(photos)
-        mask = masks.of(shot.path.relative_to(photos).as_posix()) if is_inside else None
+        mask = masks.of(shot.path) if shot.rig is None else None
         found.append(shot if mask is None else replace(shot, mask_path=mask))
-    masks.warn_unless_used(sum(shot.mask_path is not None for shot in found))
+    masks.warn_unless_used()
     return found
 
 

@@ -161,7 +161,7 @@ def fit(
     cameras = CameraSettings(estimator, dict(estimator_options or {}), seed, frames, allow_missing)
     loading: dict[str, Any] = {"holdout": holdout, "max_size": max_size}
 
-    with ExitStack() as ending, open_run(out, progress, resume=resume) as run:
+    with open_run(out, progress, resume=resume) as run, ExitStack() as ending:
         followed = None
         if run.out is not None:
             followed = ending.enter_context(FollowedRun(run.out))

@@ -110,7 +110,8 @@ def prepare(
         raise IgsrError(f"{capture.path} has no train views to fit.")
     frame = Frame.of_capture(capture)
     given_capture = capture = frame.capture(capture)
-    initial, frozen = (one and frame.splats(one) for one in (initial, frozen))
+    initial = None if initial is None else frame.splats(initial)
+    frozen = None if frozen is None else frame.splats(frozen)
     views = capture.train_views
     statistics = photo_statistics(photos_among(views))
     if initial is None:

@@ -22,8 +22,10 @@ EXTENT = 5.0
 #: Cameras nearer to each other than this, as a fraction of the distance to the scene, are at one
 #: place.
 ONE_PLACE = 1e-6
-#: Maximum extent of cameras, world units: the squares of splats' scales must be finite in float32.
-MAX_EXTENT = 1e15
+#: Relative error of the centers of cameras.
+ROUNDING = 1e-12
+#: Maximum extent of cameras, world units.
+MAX_EXTENT = 1e9
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,10 +35,13 @@ class Frame:
     Attributes:
         origin: float64 [3], world units.
         unit: length, world units.
+        one_place: whether all cameras are at the origin: their centers differ by rounding, from
+            which no distance must be derived.
     """
 
     origin: Float64
     unit: float
+    one_place: bool = False
 
     @classmethod
     def of_capture(cls, capture: Capture) -> Frame:
@@ -55,9 +60,9 @@ class Frame:
                 f"{capture.path}: its cameras are {extent:.1g} units apart, which splats cannot "
                 "hold; check its poses."
             )
-        if extent <= ONE_PLACE * distance or extent == 0.0:
-            extent = distance
-        return cls(origin, _unit(extent))
+        rounding = ROUNDING * float(np.abs(centers).max())
+        one_place = extent <= max(ONE_PLACE * distance, rounding)
+        return cls(origin, _unit(distance if one_place else extent), one_place)
 
     @classmethod
     def of_splats(cls, splats: Splats) -> Frame:
@@ -74,6 +79,8 @@ class Frame:
         """The camera in the frame; it sees the same picture there."""
         viewmat = camera.viewmat.copy()
         viewmat[:3, 3] = (viewmat[:3, 3] + viewmat[:3, :3] @ self.origin) / self.unit
+        if self.one_place:
+            viewmat[:3, 3] = 0.0
         return replace(camera, viewmat=viewmat)
 
     def view(self, view: View) -> View:

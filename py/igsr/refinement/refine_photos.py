@@ -144,7 +144,7 @@ def refine(
     max_size = default_max_size(name, quality) if max_size is None else max_size
     cameras = CameraSettings(estimator, dict(estimator_options or {}), seed, frames, allow_missing)
     denoiser = denoiser or round_denoiser()
-    with ExitStack() as ending, open_run(out, progress, resume=resume) as run:
+    with open_run(out, progress, resume=resume) as run, ExitStack() as ending:
 
         def announce(seen: Overview, cameras_known: bool) -> None:
             if run.is_followed:

@@ -66,10 +66,13 @@ pub struct Fitter {
     step: u32,
 }
 
-/// The extent of cameras; 1 if all centers coincide.
+/// Cameras of a smaller extent, in the frame of a fit, are at one place.
+const ONE_PLACE: f64 = 1e-5;
+
+/// The extent of cameras; 1 if they are at one place.
 fn scene_extent(cameras: &[Camera]) -> f64 {
     let extent = camera_extent(&cameras.iter().map(Camera::center).collect::<Vec<_>>());
-    if extent > 1e-9 { extent } else { 1.0 }
+    if extent > ONE_PLACE { extent } else { 1.0 }
 }
 
 impl Fitter {

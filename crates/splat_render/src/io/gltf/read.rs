@@ -28,8 +28,6 @@ struct Part<'a> {
     positions: Accessor<'a>,
     rotations: Accessor<'a>,
     scales: Accessor<'a>,
-    /// Whether scales are logarithms: linear ones are not negative.
-    is_log: bool,
     opacities: Accessor<'a>,
     sh: Vec<Accessor<'a>>,
 }
@@ -66,7 +64,12 @@ pub fn parse(bytes: &[u8], format: Format, named: &Named<'_>) -> Result<Loaded> 
             named.bad(format!("shows no splats ({EXTENSION}); give a file of Gaussian splats"))
         );
     }
-    if parts.iter().any(|part| part.is_log) {
+    // Linear scales are not negative; a few may be damaged.
+    let negative = |part: &Part<'_>| {
+        (0..part.count).filter(|&i| part.scales.row::<3>(i).iter().any(|&v| v < 0.0)).count() as u64
+    };
+    let is_log = 2 * parts.iter().map(negative).sum::<u64>() > total;
+    if is_log {
         notes
             .push("its scales are logarithms, which glTF does not allow; read as such.".to_owned());
     }
@@ -81,7 +84,7 @@ pub fn parse(bytes: &[u8], format: Format, named: &Named<'_>) -> Result<Loaded> 
     let origin = parts.first().map_or(DVec3::ZERO, |part| part.at.translation);
     let mut first = 0;
     for part in &parts {
-        part.unpack(&mut splats, first, origin);
+        part.unpack(&mut splats, first, origin, is_log);
         first += part.count;
     }
     frame::turn(&mut splats);
@@ -150,16 +153,13 @@ impl<'a> Part<'a> {
             }
             degree = next;
         }
-        let scales = need(SCALE, 3)?;
-        let is_log = (0..scales.count).any(|i| scales.row::<3>(i).iter().any(|&v| v < 0.0));
         let part = Self {
             at,
-            is_log,
             count: positions.count,
             degree,
             positions,
             rotations: need(ROTATION, 4)?,
-            scales,
+            scales: need(SCALE, 3)?,
             opacities: need(OPACITY, 1)?,
             sh,
         };
@@ -171,7 +171,7 @@ impl<'a> Part<'a> {
     }
 
     /// Writes this part's splats, in glTF's frame, from splat `first` on.
-    fn unpack(&self, splats: &mut SplatArrays, first: usize, origin: DVec3) {
+    fn unpack(&self, splats: &mut SplatArrays, first: usize, origin: DVec3, is_log: bool) {
         let stride = splats.stride();
         let shift = self.at.translation - origin;
         let moved = self.at.rotation.is_some() || self.at.scale != 1.0 || shift != DVec3::ZERO;
@@ -186,7 +186,7 @@ impl<'a> Part<'a> {
             let [x, y, z, w] = self.rotations.row::<4>(i);
             splats.quats[to] = [w, x, y, z];
             splats.scales[to] = self.scales.row::<3>(i);
-            if !self.is_log {
+            if !is_log {
                 splats.scales[to] = splats.scales[to].map(log_scale);
             }
             let [opacity] = self.opacities.row::<1>(i);
