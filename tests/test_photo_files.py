@@ -170,7 +170,7 @@ def test_captures_in_the_folder_are_no_photos(tmp_path):
     (tmp_path / "workspace" / "sparse").mkdir()
     expected = ["0.png", "1.png", "2.png"]
     assert found(tmp_path) == (expected, "3 in the capture found/, 3 in the capture workspace/")
-    # A scene of others beside photos does not make them renders.
+    # A splat file next to photos does not make them outputs.
     photos(tmp_path / "a")
     (tmp_path / "a" / "scene.ply").write_bytes(b"")
     assert [name for name in found(tmp_path)[0] if name.startswith("a/")]

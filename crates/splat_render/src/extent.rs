@@ -6,15 +6,15 @@ use glam::DVec3;
 const FAINT_LOGIT: f32 = -2.2;
 /// Number of splats that the extent is computed from.
 const SAMPLES: usize = 20_000;
-/// Near plane of renders, as a fraction of the scene's radius: small, because the radius of a room with
-/// a view is that of the view.
+/// Near plane of renders, as a fraction of the scene's radius. Small, because distant background
+/// increases the radius.
 const NEAR_PART: f64 = 1e-4;
 
-/// Minimum number of cameras to tell outliers.
+/// Minimum number of cameras for outlier detection.
 const OUTLIERS_FROM: usize = 6;
-/// At least one camera, and at most one of so many, may be an outlier.
+/// Number of cameras per allowed outlier; one is always allowed.
 const CAMERAS_PER_OUTLIER: usize = 20;
-/// The largest distance of outliers, in that of the farthest other camera.
+/// Maximum distance of outliers, as a multiple of the farthest other camera's.
 const FARTHEST: f64 = 4.0;
 
 /// Center of the visible splats, relative to their origin, and the radius with 90 % of them, at most four

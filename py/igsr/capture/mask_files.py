@@ -1,9 +1,9 @@
 """Find the masks of photos by their customary names.
 
-Masks are in a folder ``masks``, ``mask``, ``alpha`` or ``alphas`` that is in the folder of the
-photo, next to it or further up. The mask of ``1.jpg`` is ``1.png``, ``1.jpg.png`` (COLMAP),
-``1_mask.png`` (Metashape) or ``1.jpg.mask.png`` (RealityScan), with any image suffix. The last two
-may also be in the folder of the photo. Pixels are used where the mask is white.
+A folder ``masks``, ``mask``, ``alpha`` or ``alphas`` is in the folder of the photo, or in a folder
+above. It contains the mask of ``1.jpg`` as ``1.png``, ``1.jpg.png`` (COLMAP), ``1_mask.png``
+(Metashape) or ``1.jpg.mask.png`` (RealityScan), with any image suffix. The last two may also be in
+the folder of the photo. White pixels are used.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class MaskFiles:
             folder, inside = folder.parent, [folder.name, *inside]
 
     def _indices(self, folder: Path) -> list[dict[str, Path]]:
-        """Masks beside photos of a folder, and of each of its folders of masks."""
+        """Masks in a folder of photos, and masks in each of its mask folders."""
         if folder not in self._folders:
             try:
                 entries = sorted(os.scandir(folder), key=lambda entry: entry.name)

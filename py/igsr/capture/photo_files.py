@@ -189,7 +189,7 @@ def _of_scene(place: _Place, skipped: Counter[str]) -> Iterator[Path]:
     for name in place.photos:
         if is_mask_beside(name, names | stems):
             continue
-        # One picture beside a video is its title.
+        # A single image next to a video is its thumbnail.
         if name in videos and Path(name).stem.lower() in stems and len(stems) >= MIN_PHOTOS:
             skipped["videos named like photos"] += 1
         else:

@@ -417,9 +417,9 @@ class Capture(ArrayEquality, NotebookPicture):
     def scene_extent(self) -> float:
         """1.1 times the largest distance of a training camera from ``scene_center``, world units.
 
-        3DGS scales its learning rates and thresholds by this length (Kerbl et al. 2023). Of six
-        cameras or more, single ones that are much farther than the others do not count. It is 1 if
-        all cameras are at the same place, since 0 would freeze every fit.
+        3DGS scales its learning rates and thresholds by this length (Kerbl et al. 2023). From six
+        cameras on, outliers are ignored. It is 1 if all cameras are at the same place, since 0
+        would freeze every fit.
         """
         return _core.camera_extent(self._camera_centers()) or 1.0
 
