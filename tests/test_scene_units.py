@@ -13,6 +13,7 @@ from igsr.blocks import BlockOptions, fit_in_blocks
 from igsr.capture import Points, View
 from igsr.fitting import fit_capture
 from igsr.geometry.frame import Frame
+from igsr.refinement.novel_views import novel_views
 from igsr.splats import joined
 from igsr_lab.large_scenes import towns
 
@@ -128,6 +129,19 @@ def test_floaters_are_removed(scale, shift):
     ]
     assert removed[0] == removed[1]
     assert sum(removed[0].values()) > 0
+
+
+@pytest.mark.parametrize(("scale", "shift"), WORLDS)
+def test_novel_views(scale, shift):
+    """Many are equally far from the photos; which of them are taken must not depend on the unit."""
+    frame, model = world(scale, shift), scenes.splats(count=60)
+    cameras = [scenes.ring_camera(angle) for angle in (0.0, 0.4, 0.9)]
+    views = novel_views(model, cameras, 12, "cpu")
+    moved = novel_views(frame.splats(model), [frame.camera(one) for one in cameras], 12, "cpu")
+    assert len(views) == len(moved) > 6
+    for view, other in zip(views, moved, strict=True):
+        expected = frame.camera(view.camera).center
+        np.testing.assert_allclose(other.camera.center, expected, rtol=1e-4, atol=1e-4 * scale)
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1e4])

@@ -16,8 +16,8 @@ from igsr.splats import Splats
 
 Float64 = npt.NDArray[np.float64]
 
-#: Extent of the cameras in the frame. It determines near plane, noise and scale regularizer of fits.
-#: Fits to few photos were 0.1 dB worse with 5, a usual extent of captures.
+#: Extent of the cameras in the frame. It determines near plane, noise and scale regularizer. Fits
+#: to few photos were 0.1 dB worse with 5, a usual extent of captures.
 EXTENT = 2.5
 #: Radius of given splats in the frame: large, so that the near plane of fits cuts nothing.
 RADIUS = 100.0

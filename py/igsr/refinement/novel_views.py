@@ -116,7 +116,8 @@ def _add_farthest(
         [_angles(_target(v.camera, d), v.camera.center, around).min() for v, d in group]
     )
     while len(chosen) < count and len(apart) and apart.max() >= MIN_STEP * STEP:
-        best = int(np.argmax(apart))
+        # The first of equally far views: rounding, which depends on the unit, must not decide.
+        best = int(np.argmax(np.round(apart, 2)))
         view, reach = group[best]
         apart[best] = 0.0
         if not _is_outside(splats, view.camera, reach, backend):
