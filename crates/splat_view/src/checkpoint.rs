@@ -33,14 +33,17 @@ pub fn read_checkpoint(path: &Path) -> Result<SplatFile> {
     let sh_degree = degree.ok_or_else(|| bad(format!("{stride} SH coefficients")))?;
     let mut doubles = |name: &str| read_doubles(&mut archive, name).map_err(&bad);
     let (origin, frame) = (doubles("origin")?, doubles("frame")?);
-    let ([x, y, z], [at @ .., unit]) = (&origin[..], &frame[..]) else {
-        return Err(bad("its origin is not three numbers".to_owned()));
-    };
-    if at.len() != 3 || !origin.iter().chain(&frame).all(|v| v.is_finite()) || *unit <= 0.0 {
-        return Err(bad("its frame is not three finite numbers and a unit".to_owned()));
+    let is_finite = |values: &[f64]| values.iter().all(|v| v.is_finite());
+    let [x, y, z] = origin[..] else { return Err(bad("its origin is missing".to_owned())) };
+    if !is_finite(&origin) {
+        return Err(bad("its origin is not three finite numbers".to_owned()));
     }
-    // The fit's frame is in the world at `at`, in lengths of `unit`.
-    let origin = [at[0] + unit * x, at[1] + unit * y, at[2] + unit * z];
+    // The frame of the fit: its origin in the world, and its unit.
+    let frame = <[f64; 4]>::try_from(frame).ok().filter(|v| is_finite(v) && v[3] > 0.0);
+    let Some([at_x, at_y, at_z, unit]) = frame else {
+        return Err(bad("its frame is not three finite numbers and a unit".to_owned()));
+    };
+    let origin = [at_x + unit * x, at_y + unit * y, at_z + unit * z];
     let longer = |v: f32| (f64::from(v) * unit) as f32;
     let rows = |values: Vec<f32>| values.chunks_exact(3).map(|v| [v[0], v[1], v[2]]).collect();
     let splats = SplatArrays {

@@ -136,11 +136,16 @@ fn a_checkpoint_gives_the_picture_of_its_scene() {
     // Means are relative to an origin that f32 could not hold them at.
     file.origin = [1e7, -2e7, 5.0];
     write(&folder.join("a/scene.ply"), &file);
-    std::fs::create_dir_all(folder.join("b")).expect("folder");
-    write_checkpoint(&folder.join("b/checkpoint.npz"), &file);
+    for name in ["b", "c"] {
+        std::fs::create_dir_all(folder.join(name)).expect("folder");
+    }
+    write_checkpoint(&folder.join("b/checkpoint.npz"), &file, ([0.0; 3], 1.0));
+    // A fit's frame has its own origin and unit; the logarithm of the unit is rounded.
+    write_checkpoint(&folder.join("c/checkpoint.npz"), &file, ([1.0, -2.0, 0.5], 4.0));
     let draw = |name: &str| draw(&folder.join(name), "--size 80x60").0;
     let scene = draw("a");
-    let apart = scene.apart(&draw("b"));
+    assert!(scene == draw("b"));
+    let apart = scene.apart(&draw("c"));
     assert!(apart.0 <= 1, "off by {apart:?}");
     assert_lit(&scene);
 }
@@ -245,7 +250,7 @@ fn the_first_view_of_a_run_s_models_is_the_first_photo_s() {
     write(&folder.join(scenes[0]), &file);
     write(&folder.join(scenes[1]), &file);
     std::fs::create_dir_all(folder.join("out/checkpoints")).expect("folder");
-    write_checkpoint(&folder.join(scenes[2]), &file);
+    write_checkpoint(&folder.join(scenes[2]), &file, ([0.0; 3], 1.0));
     let other = Camera { viewmat: DMat4::from_translation(DVec3::Z * 6.0), ..camera() };
     write_cameras(&folder.join("out/cameras.json"), &[camera(), other]);
     let report = r#"{"test": {"protocol": {"background": [1.0, 0.5, 0.25]}}}"#;

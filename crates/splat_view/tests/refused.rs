@@ -35,8 +35,8 @@ fn files_without_valid_splats_are_refused_in_one_message() {
     for origin in [f64::NAN, f64::INFINITY] {
         file.origin[1] = origin;
         let path = folder.join("checkpoint.npz");
-        write_checkpoint(&path, &file);
-        refused(&mut command(&path, "--screenshot x.png"), &["checkpoint.npz", "frame"]);
+        write_checkpoint(&path, &file, ([0.0; 3], 1.0));
+        refused(&mut command(&path, "--screenshot x.png"), &["checkpoint.npz", "origin"]);
     }
     refused(&mut command(&folder.join("no.ply"), ""), &["no.ply", "cannot be opened"]);
     refused(&mut command(&Folder::new().0, "--time 1"), &["holds no scene.ply"]);

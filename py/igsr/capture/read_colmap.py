@@ -51,12 +51,16 @@ def find_model(path: Path) -> Path | None:
     It is the one of ``sparse/0``, ``sparse/1`` ... with the most images, else ``sparse`` or the
     capture itself.
     """
-    numbered = [folder for folder in (path / "sparse").glob("[0-9]*") if _is_model(folder)]
+    numbered = _numbered_models(path)
     if len(numbered) == 1:
         return numbered[0]
     if numbered:
         return min(numbered, key=lambda folder: (-colmap_files.image_count(folder), folder.name))
     return next(filter(_is_model, (path / "sparse", path)), None)
+
+
+def _numbered_models(path: Path) -> list[Path]:
+    return [folder for folder in (path / "sparse").glob("[0-9]*") if _is_model(folder)]
 
 
 def _is_model(folder: Path) -> bool:
@@ -102,10 +106,11 @@ def describe_colmap(
                 f"{images_path}: image {image.identity} has no name; export the model again"
             )
     images.sort(key=lambda image: image.name)
-    others = [folder for folder in (path / "sparse").glob("[0-9]*") if _is_model(folder)]
-    if len(others) > 1 and model in others:
+    numbered = _numbered_models(path)
+    if len(numbered) > 1 and model in numbered:
         warn_user(
-            f"{model.parent} has {len(others)} models; {model.name}, with the most images, is used."
+            f"{model.parent} has {len(numbered)} models; {model.name}, with the most images, is "
+            "used."
         )
     if not images:
         raise IgsrError(f"{images_path} lists no images; give a model with registered images")

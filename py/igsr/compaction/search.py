@@ -38,6 +38,7 @@ from igsr.fitting.fitter import fit_device
 from igsr.geometry.frame import Frame
 from igsr.run import open_run
 from igsr.splats import MAX_SH_DEGREE, Splats
+from igsr.splats import subset as splats_subset
 
 #: Fraction of the splats that a pruning round keeps; many small rounds lose less than a large one.
 KEPT_FRACTION = 0.8
@@ -115,25 +116,27 @@ def compact(
         raise IgsrError("Antialiased splats cannot be compacted: fits render without antialiasing.")
     name = _core.resolve_backend(backend)
     frame = Frame.of_splats(splats)
-    splats = frame.splats(splats)
-    capture = capture and frame.capture(capture)
     # A backdrop would be pruned, since photos show little of it.
-    bare = splats.without_backdrop()
+    given = splats.without_backdrop()
+    bare = frame.splats(given)
     finite = subset(fresh_state(bare), np.flatnonzero(bare.finite))
-    whole = splats_of(finite, splats.origin)
+    whole = splats_of(finite, bare.origin)
     if len(whole) == 0:
         raise IgsrError("The scene has no finite splats to compact.")
     if capture is None:
         validation = self_validation(whole, background, psnr, name)
     else:
-        validation = photo_validation(whole, capture, background, name)
+        validation = photo_validation(whole, frame.capture(capture), background, name)
     with open_run(None, progress) as run:
         search = _Search(
             validation, frame, whole.origin, max_loss, sh_degree, steps, seed, name, run.report
         )
         best = search.run(whole)
+    smallest = frame.inverse.splats(splats_of(best.state, whole.origin))
+    if best.row is search.curve[0]:
+        smallest = splats_subset(given, given.finite)  # without the rounding of the frame
     return Compaction(
-        frame.inverse.splats(splats_of(best.state, whole.origin).with_backdrop_of(splats)),
+        smallest.with_backdrop_of(splats),
         {
             "max_loss": float(max_loss),
             "whole": search.curve[0],

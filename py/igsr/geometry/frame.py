@@ -16,9 +16,9 @@ from igsr.splats import Splats
 
 Float64 = npt.NDArray[np.float64]
 
-#: Extent of the cameras in the frame. It determines near plane, noise and scale regularizer. Fits
-#: to few photos were 0.1 dB worse with 5, a usual extent of captures.
-EXTENT = 2.5
+#: Extent of the cameras in the frame; usual captures have about this extent. It determines near
+#: plane, noise and scale regularizer of fits.
+EXTENT = 5.0
 #: Radius of given splats in the frame: large, so that the near plane of fits cuts nothing.
 RADIUS = 100.0
 #: Cameras nearer to each other than this, as a fraction of the distance to the scene, are at one

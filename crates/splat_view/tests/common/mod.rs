@@ -101,7 +101,7 @@ pub fn write_in_levels(folder: &Folder, file: &SplatFile) -> PathBuf {
 }
 
 /// A checkpoint as numpy's savez writes it.
-pub fn write_checkpoint(path: &Path, file: &SplatFile) {
+pub fn write_checkpoint(path: &Path, file: &SplatFile, (at, unit): ([f64; 3], f64)) {
     let mut zip = zip::ZipWriter::new(std::fs::File::create(path).expect("file"));
     let stored =
         zip::write::SimpleFileOptions::default().compression_method(zip::CompressionMethod::Stored);
@@ -120,8 +120,6 @@ pub fn write_checkpoint(path: &Path, file: &SplatFile) {
     };
     let floats = |values: &[f32]| values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>();
     let (s, n) = (&file.splats, file.splats.len());
-    // A fit's frame has its own origin and unit.
-    let (at, unit) = ([1.0, -2.0, 0.5], 4.0f64);
     let means: Vec<f32> = s.means.as_flattened().iter().map(|v| v / unit as f32).collect();
     let scales: Vec<f32> = s.scales.as_flattened().iter().map(|v| v - unit.ln() as f32).collect();
     member("means", "<f4", &format!("{n}, 3"), floats(&means));
