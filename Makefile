@@ -107,8 +107,9 @@ example-capture: build
 
 test: check-system check-rust check-python
 
+# The tests of a file share a process here: two processes that build the wheel overwrite each other's.
 test-long: check-system build $(VENV)/.dev-ready $(VENV)/ray
-	$(PYTEST) -m long --ignore=tests/test_blocks_ray.py
+	$(PYTEST) --dist loadfile -m long --ignore=tests/test_blocks_ray.py
 	PYTHONPATH="$(CURDIR)/$(VENV)/ray" $(BIN)/python -m pytest -m long tests/test_blocks_ray.py
 
 # Ray is 260 MB, and tests ask what igsr says without it: so it lies beside the environment, which has
