@@ -160,11 +160,17 @@ def test_dtu_has_a_list_of_train_photos():
     capture = scenes.capture(views=49, size=16)
     chosen = dtu_views(capture, 6)
     assert names(chosen.train_views) == [25, 22, 28, 40, 44, 48]
-    assert sorted(names(chosen.views)) == list(range(49))
+    tested = names(chosen.test_views)
+    assert (len(tested), tested[0], tested[-1]) == (25, 1, 47)
+    assert not {0, 8, 13, 25, 22, 28, 40, 44, 48} & set(tested)
     with pytest.raises(igsr.IgsrError, match="views must be from 1 to 9 for DTU, not 10"):
         dtu_views(capture, 10)
-    with pytest.raises(igsr.IgsrError, match="has 40 photos; DTU's protocol needs number 48"):
-        dtu_views(Capture(capture.path, capture.views[:40]), 6)
+    with pytest.raises(igsr.IgsrError, match="has 40 photos; DTU's protocol needs number 47"):
+        dtu_views(Capture(capture.path, capture.views[:40]), 3)
+    masked = [replace(view, mask=np.ones((16, 16), bool)) for view in capture.views]
+    chosen = dtu_views(Capture(capture.path, masked), 3)
+    assert all(view.mask is None for view in chosen.train_views)
+    assert all(view.mask is not None for view in chosen.test_views)
 
 
 def test_few_photos_has_a_row_by_scene_views_and_preset(real, tmp_path, monkeypatch, lab_here):

@@ -110,6 +110,14 @@ OPTIONS: dict[str, Any] = {
     "features": _file(
         "--features", "SqueezeNet 1.0 arrays (.npz), to score a perceptual distance (not LPIPS)."
     ),
+    "lpips": Annotated[
+        str | None,
+        option(
+            "--lpips",
+            metavar="alex|vgg|squeeze",
+            help="Also score LPIPS v0.1 with this backbone, which is downloaded.",
+        ),
+    ],
     "pairs": _file("--pairs", "Training pairs, to compare their artifacts with.", "PAIRS"),
 }
 #: Names in ``OPTIONS`` of arguments whose options differ between studies.
@@ -282,12 +290,17 @@ def _rounds_line(row: Row) -> str:
     )
 
 
-_add("blender8", "Fit NeRF Synthetic from eight photos.", _fit_line, "view_ids", "presets")
+_add(
+    "blender8",
+    "Fit NeRF Synthetic from eight photos.",
+    _fit_line,
+    *("view_ids", "presets", "lpips"),
+)
 _add(
     "few_photos",
     "Fit real captures from 3, 6 and 9 photos, or 3, 6 and 12 of the tankard.",
     _fit_line,
-    *("counts", "presets"),
+    *("counts", "presets", "lpips"),
 )
 _add(
     "pose_noise",

@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from igsr._internal.choices import FitBackend
 from igsr.capture import Capture, load_capture
 from igsr.errors import IgsrError
-from igsr.evaluation.scores import default_background, evaluate
+from igsr.evaluation import metrics
+from igsr.evaluation.scores import ScoredView, default_background, evaluate
 from igsr.fitting.fit_capture import fit_capture
 from igsr.fitting.pose_refinement import refine_cameras
 from igsr.fitting.result import FitResult
+from igsr_lab.denoiser.perceptual_distance import (
+    Backbone,
+    Distance,
+    lpips_distance,
+    picture_distance,
+)
 from igsr_lab.presets import PRESETS, Preset, preset_keywords, preset_settings
 from igsr_lab.report_parts import (
     draw_psnr,
@@ -23,8 +32,9 @@ from igsr_lab.report_parts import (
     save_figure,
 )
 from igsr_lab.resumable_jobs import Run
+from igsr_lab.study.published import published
 from igsr_lab.study.scoring import aligned_views
-from igsr_lab.study.splits import dtu_views, is_dtu, llff_views, with_train_views
+from igsr_lab.study.splits import DTU_TEST, dtu_views, is_dtu, llff_views, with_train_views
 from igsr_lab.study.study import SCORE_COLUMNS, Row, Study, by_preset, grouped, with_spread
 
 #: Indices into the train split of NeRF Synthetic, by few-view papers; codes based on 3DGS have 76
@@ -54,6 +64,7 @@ class Fit:
     preset: Preset
     seed: int
     backend: FitBackend
+    lpips: Backbone | None = None
 
 
 #: Loads the photos of a fit from the folder of scenes. A function of a module, for new processes.
@@ -66,6 +77,7 @@ def blender8(
     scenes: tuple[str, ...] = ("chair", "lego"),
     views: tuple[str, ...] = tuple(VIEW_IDS),
     presets: tuple[Preset, ...] = PRESETS,
+    lpips: Backbone | None = None,
 ) -> Row:
     """Fit NeRF Synthetic from eight photos.
 
@@ -74,6 +86,7 @@ def blender8(
         scenes: names of folders in the data.
         views: keys of ``VIEW_IDS``.
         presets: names of ``PRESETS``.
+        lpips: also score LPIPS with this backbone, which torchvision downloads.
 
     Returns:
         The content of ``study.json``: "mean" by preset, with the standard deviation of each score
@@ -84,7 +97,7 @@ def blender8(
         raise IgsrError(f"views must be of {', '.join(VIEW_IDS)}, not {unknown[0]!r}.")
     study.check_scenes(scenes, "transforms_train.json")
     photos = {(scene, key): len(VIEW_IDS[key]) for scene in scenes for key in views}
-    rows = fitted(study, load_blender8, photos, presets)
+    rows = fitted(study, load_blender8, photos, presets, lpips=lpips)
     protocol = {
         "name": "blender8",
         "train_views": {key: list(VIEW_IDS[key]) for key in views},
@@ -100,18 +113,21 @@ def few_photos(
     scenes: tuple[str, ...] = ("fern", "dtu_scan24", "tankard"),
     views: tuple[str, ...] | None = None,
     presets: tuple[Preset, ...] = PRESETS,
+    lpips: Backbone | None = None,
 ) -> Row:
     """Fit real captures from few photos.
 
-    Scenes whose name starts with "dtu" have DTU's split, all others LLFF's. Masked pixels are not
-    fitted or scored. "psnr_refined" is the score after test cameras were fitted to their photos,
-    for presets that move cameras.
+    Scenes whose name starts with "dtu" have DTU's split, all others LLFF's. Photos of DTU are
+    fitted whole and scored as in papers: PSNR in their masks, SSIM of pictures that are white
+    outside. Elsewhere masked pixels are not fitted or scored. "psnr_refined" is the score after
+    test cameras were fitted to their photos, for presets that move cameras.
 
     Args:
         study: its data has captures.
         scenes: names of folders in the data.
         views: numbers of photos to fit; None is 3, 6 and 9, or 3, 6 and 12 of the tankard.
         presets: names of ``PRESETS``.
+        lpips: as ``blender8``.
 
     Returns:
         The content of ``study.json``, as ``blender8``; "protocol" names the fitted photos.
@@ -134,13 +150,14 @@ def few_photos(
                 count: [view.name for view in few.train_views] for count, few in chosen.items()
             },
         }
-    rows = fitted(study, load_few_photos, photos, presets, refined=True)
+    rows = fitted(study, load_few_photos, photos, presets, refined=True, lpips=lpips)
     scored = rows[0]["protocol"]
     protocol = {
         "name": "few-photos",
         "splits": {
             "LLFF": "every 8th photo is scored, evenly spaced ones of the rest are fitted",
-            "DTU": "all photos that are not fitted are scored",
+            "DTU": f"photos {', '.join(map(str, DTU_TEST))} are scored, PSNR in their masks, SSIM "
+            "of pictures that are white outside",
         },
         "scenes": splits,
         "seeds": study.seeds,
@@ -172,16 +189,20 @@ def fitted(
     photos: dict[tuple[str, str], int],
     presets: tuple[Preset, ...],
     refined: bool = False,
+    lpips: Backbone | None = None,
 ) -> list[Row]:
     """Execute all fits, seed by seed, so that an interrupted study has fits of all kinds.
 
     ``photos`` is the number of fitted photos by scene and views.
     """
-    more = {"refined": True} if refined else {}
+    more: Row = {"refined": True} if refined else {}
+    if lpips is not None:
+        lpips_distance(lpips)  # before the first fit, so that an error does not come up after it
+        more["lpips"] = lpips
     runs = [
         Run(
             f"{scene}-views{views}-{preset}-seed{seed}-{study.backend}",
-            Fit(scene, views, preset, seed, study.backend),
+            Fit(scene, views, preset, seed, study.backend, lpips),
             preset_settings(preset, photos[scene, views]) | more,
             scene=scene,
         )
@@ -198,8 +219,9 @@ def run_fit(load: Load, data: str, fit: Fit, refined: bool = False) -> Row:
     capture = load(data, fit)
     keywords = preset_keywords(fit.preset, capture)
     result = fit_capture(capture, backend=fit.backend, seed=fit.seed, **keywords)
-    scores = evaluate(result.splats, capture, backend=fit.backend)
-    row: Row = {**vars(fit), **{name: scores[name] for name in SCORES}}
+    more = MoreScores(white_outside=is_dtu(fit.scene), lpips=fit.lpips)
+    scores = evaluate(result.splats, capture, backend=fit.backend, on_view=more.add)
+    row: Row = {**vars(fit), **{name: scores[name] for name in SCORES}, **more.means()}
     if refined:
         row["psnr_refined"] = refined_psnr(result, capture, fit.backend)
     return row | {
@@ -207,6 +229,39 @@ def run_fit(load: Load, data: str, fit: Fit, refined: bool = False) -> Row:
         "seconds": round(result.seconds, 2),
         "protocol": scores["protocol"],
     }
+
+
+class MoreScores:
+    """Scores of papers that ``evaluate`` does not have: "lpips", and "ssim" of white masks.
+
+    Args:
+        white_outside: make pictures white outside their masks.
+        lpips: LPIPS' backbone, or None.
+    """
+
+    def __init__(self, white_outside: bool, lpips: Backbone | None) -> None:
+        self._white_outside = white_outside
+        self._lpips: Distance | None = None
+        if lpips is not None:
+            self._lpips = lpips_distance(lpips)
+        self._rows: list[dict[str, float]] = []
+
+    def add(self, view: ScoredView) -> None:
+        """Score a view."""
+        render, photo = view.render, view.photo
+        if self._white_outside and view.mask is not None:
+            inside, white = view.mask[..., None], np.uint8(255)
+            render, photo = np.where(inside, render, white), np.where(inside, photo, white)
+        row = {}
+        if self._white_outside:
+            row["ssim"] = metrics.ssim(render, photo)
+        if self._lpips is not None:
+            row["lpips"] = picture_distance(self._lpips, render, photo)
+        self._rows.append(row)
+
+    def means(self) -> dict[str, float]:
+        """The means over the views."""
+        return {name: float(np.mean([row[name] for row in self._rows])) for name in self._rows[0]}
 
 
 def refined_psnr(result: FitResult, capture: Capture, backend: FitBackend) -> float:
@@ -223,6 +278,7 @@ def refined_psnr(result: FitResult, capture: Capture, backend: FitBackend) -> fl
 def write_report(study: Study, title: str, rows: list[Row], protocol: Row) -> Row:
     """Write the study's files; return the content of ``study.json``."""
     scores = [name for name in SCORE_COLUMNS if name in rows[0]]
+    photos = {views: "8" if views in VIEW_IDS else views for views in {r["views"] for r in rows}}
     groups = {
         (scene, views): same
         for scene, of_scene in grouped(rows, "scene").items()
@@ -236,6 +292,7 @@ def write_report(study: Study, title: str, rows: list[Row], protocol: Row) -> Ro
         "protocol": protocol,
         "mean": by_preset(rows, scores),
         "scenes": scenes,
+        "published": published_rows([(scene, photos[views]) for scene, views in groups]),
         "runs": rows,
     }
     figure = new_figure(1.5 + 1.3 * len(groups), 4.0)
@@ -246,6 +303,15 @@ def write_report(study: Study, title: str, rows: list[Row], protocol: Row) -> Ro
     axis.set_title(title, fontsize=10)
     save_figure(figure, study.out / "study.png")
     return study.write(report, table_lines)
+
+
+def published_rows(groups: Sequence[tuple[str, str]]) -> list[Row]:
+    """Published results on the photos of scenes and numbers of photos."""
+    return [
+        {"scene": scene, "photos": photos, **one._asdict()}
+        for scene, photos in dict.fromkeys(groups)
+        for one in published(scene, photos)
+    ]
 
 
 def table_lines(report: Row) -> list[str]:
@@ -267,4 +333,13 @@ def table_lines(report: Row) -> list[str]:
         for preset, scores in presets.items()
     ]
     heads = ["scene", "views", "preset", *(SCORE_COLUMNS[name][0] for name in names)]
-    return markdown_table(heads, rows, left=3)
+    lines = markdown_table(heads, rows, left=3)
+    if report["published"]:
+        cells = [
+            [*(one[name] for name in ("scene", "photos", "method")), f"{one['psnr']:.2f}"]
+            + ["–" if one["ssim"] is None else f"{one['ssim']:.3f}", one["source"]]
+            for one in report["published"]
+        ]
+        heads = ["scene", "photos", "published", "PSNR, dB", "SSIM", "of, source"]
+        lines += ["", *markdown_table(heads, cells, left=3)]
+    return lines

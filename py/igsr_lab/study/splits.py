@@ -15,6 +15,8 @@ from igsr.errors import IgsrError
 HOLDOUT = 8
 #: DTU's train photos by PixelNeRF; few-view papers take the first 3, 6 or 9.
 DTU_TRAIN = (25, 22, 28, 40, 44, 48, 0, 8, 13)
+#: DTU's scored photos by PixelNeRF, as few-view papers have them.
+DTU_TEST = (1, 2, *range(9, 13), 14, 15, 23, 24, 26, 27, *range(29, 36), 41, 42, 43, 45, 46, 47)
 
 
 def with_train_views(capture: Capture, ids: Sequence[int]) -> Capture:
@@ -52,17 +54,20 @@ def llff_views(capture: Capture, count: int) -> Capture:
 def dtu_views(capture: Capture, count: int) -> Capture:
     """Split by DTU's few-view protocol, with photos sorted by name.
 
-    The first ``count`` photos of ``DTU_TRAIN`` are fitted, all others are scored.
+    The first ``count`` photos of ``DTU_TRAIN`` are fitted, whole; ``DTU_TEST`` are scored, in their
+    masks.
     """
     if not 1 <= count <= len(DTU_TRAIN):
         raise IgsrError(f"views must be from 1 to {len(DTU_TRAIN)} for DTU, not {count}.")
     train = DTU_TRAIN[:count]
-    if max(train) >= len(capture.views):
+    last = max(*train, *DTU_TEST)
+    if last >= len(capture.views):
         raise IgsrError(
-            f"{capture.path} has {len(capture.views)} photos; DTU's protocol needs number "
-            f"{max(train)}."
+            f"{capture.path} has {len(capture.views)} photos; DTU's protocol needs number {last}."
         )
-    return _split(capture, train, [i for i in range(len(capture.views)) if i not in train])
+    chosen = _split(capture, train, DTU_TEST)
+    views = [replace(view, mask=None) if view.split == "train" else view for view in chosen.views]
+    return Capture(capture.path, views, capture.points)
 
 
 def _split(capture: Capture, train: Sequence[int], test: Sequence[int]) -> Capture:

@@ -25,6 +25,7 @@ SCORE_COLUMNS = {
     "psnr": ("PSNR, dB", ".2f"),
     "psnr_refined": ("refined PSNR, dB", ".2f"),
     "ssim": ("SSIM", ".4f"),
+    "lpips": ("LPIPS", ".4f"),
     "ms_ssim": ("MS-SSIM", ".4f"),
     "flip": ("FLIP", ".4f"),
     "cc_psnr": ("cc PSNR, dB", ".2f"),
