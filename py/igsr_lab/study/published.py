@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 
 class Published(NamedTuple):
-    """Scores of a method: PSNR in dB, SSIM or None, and what they are of."""
+    """Scores of a method: PSNR in dB, SSIM or None, and their scenes and source."""
 
     method: str
     psnr: float
