@@ -64,7 +64,7 @@ class Fit:
     preset: Preset
     seed: int
     backend: FitBackend
-    lpips: Backbone | None = None
+    lpips_backbone: Backbone | None = None
 
 
 #: Loads the photos of a fit from the folder of scenes. A function of a module, for new processes.
@@ -219,7 +219,7 @@ def run_fit(load: Load, data: str, fit: Fit, refined: bool = False) -> Row:
     capture = load(data, fit)
     keywords = preset_keywords(fit.preset, capture)
     result = fit_capture(capture, backend=fit.backend, seed=fit.seed, **keywords)
-    more = MoreScores(white_outside=is_dtu(fit.scene), lpips=fit.lpips)
+    more = MoreScores(white_outside=is_dtu(fit.scene), lpips=fit.lpips_backbone)
     scores = evaluate(result.splats, capture, backend=fit.backend, on_view=more.add)
     row: Row = {**vars(fit), **{name: scores[name] for name in SCORES}, **more.means()}
     if refined:
