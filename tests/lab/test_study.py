@@ -11,6 +11,8 @@ from ray_stand_in import stand_in_ray
 
 import igsr
 from igsr.capture import Capture
+from igsr.evaluation import metrics
+from igsr.evaluation.scores import ScoredView
 from igsr_lab.presets import PRESETS, preset_settings
 from igsr_lab.resumable_jobs import folder_hash
 from igsr_lab.study import Study, blender8, few_photos, preset_fits
@@ -171,6 +173,30 @@ def test_dtu_has_a_list_of_train_photos():
     chosen = dtu_views(Capture(capture.path, masked), 3)
     assert all(view.mask is None for view in chosen.train_views)
     assert all(view.mask is not None for view in chosen.test_views)
+
+
+def test_pictures_of_dtu_are_white_outside_their_masks():
+    photo = np.full((16, 16, 3), 200, np.uint8)
+    mask = np.zeros((16, 16), bool)
+    mask[4:12, 4:12] = True
+    render = np.where(mask[..., None], photo, np.uint8(7))
+    view = ScoredView("1", photo, render, mask, {"psnr": 100.0})
+    for white, same in ((True, True), (False, None)):
+        more = preset_fits.MoreScores(white_outside=white, lpips=None)
+        more.add(view)
+        assert more.means() == ({"ssim": pytest.approx(1.0)} if same else {})
+    more = preset_fits.MoreScores(white_outside=True, lpips=None)
+    more.add(replace(view, render=np.full_like(photo, 100)))
+    white_photo, white_render = photo.copy(), np.full_like(photo, 100)
+    white_photo[~mask] = white_render[~mask] = 255
+    assert more.means()["ssim"] == pytest.approx(metrics.ssim(white_render, white_photo))
+    assert more.means()["ssim"] < 0.999
+
+
+def test_published_results_are_in_the_table():
+    rows = preset_fits.published_rows([("fern", "3"), ("dtu_1", "3"), ("leaf", "3")])
+    assert {row["scene"] for row in rows} == {"fern", "dtu_1"}
+    assert max(row["psnr"] for row in rows if row["scene"] == "fern") == 23.84
 
 
 def test_few_photos_has_a_row_by_scene_views_and_preset(real, tmp_path, monkeypatch, lab_here):

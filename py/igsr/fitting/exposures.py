@@ -5,8 +5,8 @@ gains are the robust least-squares solution (Cauchy weights, iteratively reweigh
 errors come from a delete-one-group jackknife (Efron and Stein 1981) over groups of nearby points,
 because highlights, vignetting and shadows affect nearby points alike.
 
-"auto" optimizes exposures if the gains of photos differ from those that they share most points
-with by ``MIN_SPREAD`` or more beyond their errors. A gain that drifts along a sequence of photos is
+"auto" optimizes exposures if gains differ by ``MIN_SPREAD`` or more, beyond their errors, between
+photos that share most points. A gain that drifts along a sequence of photos is
 no reason: view-dependent color can represent it. Without tracks, EXIF decides if all photos have
 it.
 """

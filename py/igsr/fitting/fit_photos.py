@@ -217,7 +217,7 @@ def _announce(
     quality: Quality,
     backend: str,
 ) -> None:
-    """Tell a person what will be done, once the photos are counted."""
+    """Print the plan of the fit, once the photos are counted."""
     if chosen.get("start") == "hull" and seen.channels < 4:
         raise IgsrError(f"{seen.path} has photos without alpha; start hull needs it in all.")
     if run.is_followed:

@@ -25,8 +25,8 @@ DROPOUT_PHOTOS = 1.2
 MAX_DROPOUT = 0.3
 MIN_DROPOUT = 0.05
 #: MCMC density control is used if photos are further apart than this (mean, degrees) and at least
-#: this fraction of them show the same place. Its pull toward faint splats acts in every step, so
-#: in large scenes, where few photos show a place, most splats would fade.
+#: this fraction of them show the same place. Its pull on opacities acts in every step. In large
+#: scenes few photos show a place, and most splats would fade.
 MCMC_SPACING_DEG = 7.0
 MCMC_VISIBLE_FRACTION = 0.5
 #: Minimum number of photos of the same place for SH degree 2; with fewer it overfits.

@@ -84,7 +84,7 @@ class Trained:
 
 @dataclass
 class _Start:
-    """Where the optimization begins: at the first step, or where a checkpoint was saved."""
+    """Start of the optimization: the first step, or a checkpoint."""
 
     state: Arrays
     origin: Origin

@@ -233,7 +233,7 @@ def refit(
 ) -> Reconstruction:
     """Fit photos and novel views from the initialization of the photos.
 
-    A fit that continued from the splats would keep what they made up where no photo shows better.
+    A fit that continued from the splats would keep their errors in places that no photo shows.
     A whole fit has another seed in each round: the same draws would err where the views err. A
     fold keeps its seed, so that chance is the same before and after its round.
 

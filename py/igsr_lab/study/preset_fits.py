@@ -336,10 +336,10 @@ def table_lines(report: Row) -> list[str]:
     lines = markdown_table(heads, rows, left=3)
     if report["published"]:
         cells = [
-            [*(one[name] for name in ("scene", "photos", "method")), f"{one['psnr']:.2f}"]
-            + ["–" if one["ssim"] is None else f"{one['ssim']:.3f}", one["source"]]
+            [*(one[name] for name in ("scene", "photos", "method", "source"))]
+            + [f"{one['psnr']:.2f}", "–" if one["ssim"] is None else f"{one['ssim']:.3f}"]
             for one in report["published"]
         ]
-        heads = ["scene", "photos", "published", "PSNR, dB", "SSIM", "of, source"]
-        lines += ["", *markdown_table(heads, cells, left=3)]
+        heads = ["scene", "photos", "published", "scenes, source", "PSNR, dB", "SSIM"]
+        lines += ["", *markdown_table(heads, cells, left=4)]
     return lines
