@@ -1,7 +1,7 @@
 """Published results on the photos of the few-photo studies, for their tables.
 
 Figures only, with the paper or repository that states each. The methods ran on their authors' GPUs
-with their own code. ``source`` has the scenes and sizes, where they differ from the study's.
+with their own code. ``source`` names the scenes and sizes if they differ from the study's.
 """
 
 from __future__ import annotations
