@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scenes
+import torch
 from made_up_tracks import projected
 
 from igsr.capture import Camera, Capture, View
@@ -213,7 +214,11 @@ def test_features_need_exact_poses(exact, expected):
 def test_the_trained_matcher_adds_points_of_photos_from_far_apart(with_aliked, monkeypatch):
     far = [photo(angle, size=300) for angle in (-0.9, 0.0, 0.9)]
     xyz, _ = matched_points(far)
-    np.testing.assert_array_equal(matched_points(far)[0], xyz)
+    before = torch.get_num_threads()
+    for count in (1, 2, 3):
+        torch.set_num_threads(count)
+        np.testing.assert_array_equal(matched_points(far)[0], xyz)
+    torch.set_num_threads(before)
     monkeypatch.setattr(module.aliked, "is_available", lambda: False)
     fewer, _ = matched_points(far)
     assert len(xyz) > 1.3 * len(fewer)

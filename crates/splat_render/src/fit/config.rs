@@ -8,6 +8,13 @@ use crate::stages::Rates;
 /// MCMC's noise on the centers, in units of 3DGS's rate (the paper's).
 const MCMC_NOISE: f32 = 5e5;
 
+/// MCMC's pulls on opacities and scales (the paper's).
+const MCMC_PULL: (f32, f32) = (0.01, 0.01);
+/// The pull on opacities has the factor up to this number of photos; then it falls as their inverse.
+/// Few photos leave floaters, which a stronger pull removes.
+const FEW_PHOTOS: f32 = 8.0;
+const FEW_PHOTOS_PULL: f32 = 3.0;
+
 /// How the number of splats is controlled.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum DensityControl {
@@ -157,6 +164,29 @@ impl FitConfig {
         }
     }
 
+    /// Weight of the mean opacity in the loss at a step (from 0). The original control has it only with
+    /// few photos: with many, a splat is visible in few steps and would fade.
+    pub(super) fn opacity_pull_at(&self, step: u32, photos: usize) -> f32 {
+        // With a stronger pull, a fitted focal length ends farther off.
+        let strongest = if self.cameras.is_some() { 1.0 } else { FEW_PHOTOS_PULL };
+        let few = strongest * (FEW_PHOTOS / photos as f32).min(1.0);
+        let factor = match self.density {
+            DensityControl::Mcmc => few.max(1.0),
+            DensityControl::Original if few > 1.0 => few,
+            _ => return 0.0,
+        };
+        // Adam takes a full step along a pull without gradients. With larger steps, a splat that few
+        // photos show would fade before the next of these photos.
+        let faster =
+            self.rates_at(step, 1.0).opacities / self.rates.opacities.max(f32::MIN_POSITIVE);
+        factor * MCMC_PULL.0 / faster.max(1.0).sqrt()
+    }
+
+    /// Weight of the mean scale in the loss.
+    pub(super) fn scale_pull(&self) -> f32 {
+        if self.density == DensityControl::Mcmc { MCMC_PULL.1 } else { 0.0 }
+    }
+
     /// Weight of the depth loss at a step (from 0); decays exponentially to a hundredth (Kerbl et al., "A
     /// Hierarchical 3D Gaussian Representation", 2024).
     pub fn depth_weight_at(&self, step: u32) -> f32 {
@@ -261,6 +291,30 @@ mod tests {
         let noise = of(DensityControl::Mcmc, 1.0);
         assert!(noise > 0.0 && (of(DensityControl::Mcmc, 3.0) / noise - 1.0).abs() < 1e-6);
         assert_eq!(of(DensityControl::Original, 3.0), 0.0);
+    }
+
+    #[test]
+    fn opacities_are_pulled_more_with_few_photos() {
+        let pull = |density, photos| {
+            FitConfig { density, ..FitConfig::default() }.opacity_pull_at(0, photos)
+        };
+        let counts = [1, 8, 12, 23, 24, 100];
+        let mcmc = counts.map(|photos| pull(DensityControl::Mcmc, photos) / 0.01);
+        let original = counts.map(|photos| pull(DensityControl::Original, photos) / 0.01);
+        for (k, factor) in [3.0, 3.0, 2.0, 24.0 / 23.0, 1.0, 1.0].into_iter().enumerate() {
+            assert!((mcmc[k] - factor).abs() < 1e-6, "{mcmc:?}");
+            assert_eq!(original[k], if k < 4 { mcmc[k] } else { 0.0 });
+        }
+        assert_eq!(pull(DensityControl::Fixed, 3), 0.0);
+        let moving = FitConfig {
+            density: DensityControl::Mcmc,
+            cameras: Some(CameraConfig::default()),
+            ..FitConfig::default()
+        };
+        assert_eq!(moving.opacity_pull_at(0, 3), 0.01);
+        let fast =
+            FitConfig { rate_scale: 4.0, density: DensityControl::Mcmc, ..FitConfig::default() };
+        assert!((fast.opacity_pull_at(0, 8) / 0.015 - 1.0).abs() < 1e-6);
     }
 
     #[test]

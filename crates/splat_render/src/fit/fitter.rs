@@ -27,8 +27,6 @@ const REFINE_STOP: (f64, f64) = (0.85, 0.5);
 const MCMC_GROWN: f64 = 0.5;
 /// Steps between two opacity resets of the original control.
 const RESET_EVERY: u32 = 3000;
-/// MCMC's pull on opacities and scales (the paper's).
-const MCMC_PULL: (f32, f32) = (0.01, 0.01);
 
 /// Purpose of a draw; part of its seed.
 #[derive(Clone, Copy)]
@@ -330,11 +328,6 @@ impl Fitter {
         };
         let progress = f64::from(step) / f64::from(config.steps);
         let rates = config.rates_at(step, self.extent);
-        let mcmc = config.density == DensityControl::Mcmc;
-        // Adam takes a full step along an unopposed pull. With larger steps, a splat seen in few photos
-        // would fade before one of them comes round again.
-        let faster = rates.opacities / config.rates.opacities.max(f32::MIN_POSITIVE);
-        let pull = MCMC_PULL.0 / faster.max(1.0).sqrt();
         let noise_seed = self.rng(Draw::Noise, u64::from(step)).random();
         let input = StepInput {
             view,
@@ -344,8 +337,8 @@ impl Fitter {
             rates,
             step: step - config.first_step + 1,
             ssim_weight: config.ssim_weight,
-            opacity_regularizer: if mcmc { pull } else { 0.0 },
-            scale_regularizer: if mcmc { MCMC_PULL.1 } else { 0.0 },
+            opacity_regularizer: config.opacity_pull_at(step, self.schedule.len()),
+            scale_regularizer: config.scale_pull(),
             noise: config.noise_at(step, self.extent),
             dropout: config.dropout * progress as f32,
             noise_seed,

@@ -9,6 +9,7 @@ error.
 from __future__ import annotations
 
 import warnings
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -61,12 +62,12 @@ def matched_points(views: list[View]) -> tuple[Float64, Float64]:
     if aliked.is_available():
         matcher = Aliked()
         photos = [Photo(view.name, view.image, mask=view.mask) for view in views]
-        learned = [usable_features(matcher, photo) for photo in photos]
+        with matcher.pool() as threads:
+            learned = list(threads.map(partial(usable_features, matcher), photos))
+            chosen = ([learned[pair[k]] for pair in photo_pairs] for k in (0, 1))
+            matched = threads.map(partial(checked_matches, matcher), *chosen)
+            found += [rows.astype(np.int64) for rows in matched]
         places += [one.xy.astype(np.float64) for one in learned]
-        found += [
-            checked_matches(matcher, learned[a], learned[b]).astype(np.int64)
-            for a, b in photo_pairs
-        ]
     first = np.cumsum([0, *map(len, places)])
     matches = [np.zeros((0, 2), dtype=np.int64)]
     for k, rows in enumerate(found):
