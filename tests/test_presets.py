@@ -53,7 +53,8 @@ def test_settings_depend_on_how_many_photos_see_a_place():
 
 def test_splats_depend_on_pixels_photos_detail_and_quality():
     def max_splats(quality="normal", **changes):
-        return settings_for(replace(statistics(8), **changes), quality).max_splats
+        photos = replace(statistics(8, spacing_deg=30.0), **changes)
+        return settings_for(photos, quality).max_splats
 
     assert (max_splats(), max_splats(photos=100)) == (30_000, 45_000)
     assert max_splats(pixels=1e9) == presets.MAX_SPLATS
@@ -62,7 +63,19 @@ def test_splats_depend_on_pixels_photos_detail_and_quality():
     assert max_splats(detail=35_000.0, photos=16) == round(35_000 * 2**0.4)
     # Finer detail is noise.
     assert max_splats(detail=90_000.0) == 50_000
-    assert max_splats("high", detail=90_000.0) == 125_000
+    assert max_splats("high", detail=90_000.0) == 50_000
+    near = [max_splats(quality, spacing_deg=5.0) for quality in presets.QUALITIES]
+    assert near == [24_000, 60_000, 75_000]
+
+
+def test_photos_from_similar_directions_have_more_steps_unless_cameras_move():
+    def steps(photos, spacing_deg, quality="normal", **options):
+        return settings_for(statistics(photos, spacing_deg=spacing_deg), quality, **options).steps
+
+    assert [steps(photos, 5.0) for photos in (1, 3, 5, 100)] == [2500] * 4
+    assert [steps(photos, 30.0) for photos in (1, 3, 8, 100)] == [250, 750, 1700, 2500]
+    assert (steps(3, 5.0, "high"), steps(3, 30.0, "high")) == (10_000, 1500)
+    assert steps(3, 5.0, poses="joint") == steps(3, 30.0, poses="joint") == 1500
 
 
 def test_given_settings_are_kept():
@@ -75,7 +88,7 @@ def test_settings_change_smoothly_with_the_number_of_photos():
     steps = splats = 0
     dropout = presets.MAX_DROPOUT
     for photos in range(1, 200):
-        settings = settings_for(statistics(photos, max(1.0, 0.4 * photos)))
+        settings = settings_for(statistics(photos, max(1.0, 0.4 * photos), spacing_deg=30.0))
         assert steps <= settings.steps <= max(2 * presets.STEPS_PER_PHOTO, 1.5 * steps)
         assert splats <= settings.max_splats <= max(30_000, 1.32 * splats)
         assert dropout - 0.1 <= settings.dropout <= dropout

@@ -12,11 +12,12 @@ from igsr.fitting.photo_statistics import PhotoStatistics
 from igsr.fitting.settings import FitSettings
 
 Quality: TypeAlias = Literal["draft", "normal", "high"]
-#: Factors on the sides of photos, the number of steps and the maximum number of splats.
-QUALITIES: dict[Quality, tuple[float, float, float]] = {
-    "draft": (0.6, 0.4, 0.4),
-    "normal": (1.0, 1.0, 1.0),
-    "high": (1.6, 2.0, 2.5),
+#: Factor on the sides of photos; then factors on the number of steps and the maximum number of
+#: splats, with "mcmc" and with "original". With "mcmc", more splats overfit few photos.
+QUALITIES: dict[Quality, tuple[float, tuple[float, float], tuple[float, float]]] = {
+    "draft": (0.6, (0.4, 0.4), (0.4, 0.8)),
+    "normal": (1.0, (1.0, 1.0), (1.0, 2.0)),
+    "high": (1.6, (2.0, 1.0), (4.0, 2.5)),
 }
 
 #: Dropout is this divided by the number of photos that see the same place, clipped to the maximum;
@@ -31,7 +32,8 @@ MCMC_SPACING_DEG = 7.0
 MCMC_VISIBLE_FRACTION = 0.5
 #: Minimum number of photos of the same place for SH degree 2; with fewer it overfits.
 SH2_PHOTOS = 12.0
-#: Steps = min(MAX_STEPS, BASE_STEPS + MORE_STEPS_PER_PHOTO n, STEPS_PER_PHOTO n) for n photos.
+#: "original" takes MAX_STEPS. With "mcmc" or joint cameras, which overfit few photos, n photos have
+#: min(MAX_STEPS, BASE_STEPS + MORE_STEPS_PER_PHOTO n, STEPS_PER_PHOTO n).
 BASE_STEPS = 1500
 MORE_STEPS_PER_PHOTO = 25
 STEPS_PER_PHOTO = 250
@@ -97,7 +99,7 @@ def default_max_size(backend: str, quality: Quality = "normal") -> int:
     return round(MAX_SIZES[backend] * _quality(quality)[0])
 
 
-def _quality(quality: Quality) -> tuple[float, float, float]:
+def _quality(quality: Quality) -> tuple[float, tuple[float, float], tuple[float, float]]:
     if quality not in QUALITIES:
         raise IgsrError(f"quality must be one of {', '.join(QUALITIES)}, not {quality!r}.")
     return QUALITIES[quality]
@@ -128,16 +130,22 @@ def _default(
 ) -> FitSettings:
     """The default settings for these photos; ``steps`` and ``joint`` are as asked for."""
     dropout = min(MAX_DROPOUT, DROPOUT_PHOTOS / statistics.overlap)
-    _, more_steps, more_splats = _quality(quality)
-    if steps is None:
-        photos = statistics.photos
-        usual = min(MAX_STEPS, BASE_STEPS + MORE_STEPS_PER_PHOTO * photos, STEPS_PER_PHOTO * photos)
-        steps = round(more_steps * usual * (JOINT_STEPS_FACTOR if joint else 1))
-    rate = 1.0 if joint else min(MAX_LEARNING_RATE, max(1.0, math.sqrt(RATE_STEPS / steps)))
     is_mcmc = (
         statistics.spacing_deg > MCMC_SPACING_DEG
         and statistics.visible_fraction >= MCMC_VISIBLE_FRACTION
     )
+    _, mcmc, original = _quality(quality)
+    more_splats = (mcmc if is_mcmc else original)[1]
+    if steps is None:
+        if joint or is_mcmc:
+            photos = statistics.photos
+            usual = min(
+                MAX_STEPS, BASE_STEPS + MORE_STEPS_PER_PHOTO * photos, STEPS_PER_PHOTO * photos
+            )
+            steps = round(mcmc[0] * usual * (JOINT_STEPS_FACTOR if joint else 1))
+        else:
+            steps = round(original[0] * MAX_STEPS)
+    rate = 1.0 if joint else min(MAX_LEARNING_RATE, max(1.0, math.sqrt(RATE_STEPS / steps)))
     more = (statistics.photos / REFERENCE_PHOTOS) ** SPLATS_POWER
     splats = max(
         SPLATS_PER_PIXEL * statistics.pixels * more,
