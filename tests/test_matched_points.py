@@ -215,10 +215,12 @@ def test_the_trained_matcher_adds_points_of_photos_from_far_apart(with_aliked, m
     far = [photo(angle, size=300) for angle in (-0.9, 0.0, 0.9)]
     xyz, _ = matched_points(far)
     before = torch.get_num_threads()
-    for count in (1, 2, 3):
-        torch.set_num_threads(count)
-        np.testing.assert_array_equal(matched_points(far)[0], xyz)
-    torch.set_num_threads(before)
+    try:
+        for count in (1, 2, 3):
+            torch.set_num_threads(count)
+            np.testing.assert_array_equal(matched_points(far)[0], xyz)
+    finally:
+        torch.set_num_threads(before)
     monkeypatch.setattr(module.aliked, "is_available", lambda: False)
     fewer, _ = matched_points(far)
     assert len(xyz) > 1.3 * len(fewer)

@@ -84,13 +84,17 @@ def test_given_settings_are_kept():
     assert settings.steps == settings_for(8).steps
 
 
-def test_settings_change_smoothly_with_the_number_of_photos():
+@pytest.mark.parametrize(
+    ("spacing_deg", "first_steps", "first_splats"),
+    [(30.0, 2 * presets.STEPS_PER_PHOTO, 30_000), (5.0, presets.MAX_STEPS, 60_000)],
+)
+def test_settings_change_smoothly_with_the_number_of_photos(spacing_deg, first_steps, first_splats):
     steps = splats = 0
     dropout = presets.MAX_DROPOUT
     for photos in range(1, 200):
-        settings = settings_for(statistics(photos, max(1.0, 0.4 * photos), spacing_deg=30.0))
-        assert steps <= settings.steps <= max(2 * presets.STEPS_PER_PHOTO, 1.5 * steps)
-        assert splats <= settings.max_splats <= max(30_000, 1.32 * splats)
+        settings = settings_for(statistics(photos, max(1.0, 0.4 * photos), spacing_deg))
+        assert steps <= settings.steps <= max(first_steps, 1.5 * steps)
+        assert splats <= settings.max_splats <= max(first_splats, 1.32 * splats)
         assert dropout - 0.1 <= settings.dropout <= dropout
         steps, splats, dropout = settings.steps, settings.max_splats, settings.dropout
     assert (steps, dropout) == (presets.MAX_STEPS, 0.0)

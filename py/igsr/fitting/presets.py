@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 from igsr._internal.settings import checked_given
 from igsr.errors import IgsrError
@@ -12,12 +12,22 @@ from igsr.fitting.photo_statistics import PhotoStatistics
 from igsr.fitting.settings import FitSettings
 
 Quality: TypeAlias = Literal["draft", "normal", "high"]
-#: Factor on the sides of photos; then factors on the number of steps and the maximum number of
-#: splats, with "mcmc" and with "original". With "mcmc", more splats overfit few photos.
-QUALITIES: dict[Quality, tuple[float, tuple[float, float], tuple[float, float]]] = {
-    "draft": (0.6, (0.4, 0.4), (0.4, 0.8)),
-    "normal": (1.0, (1.0, 1.0), (1.0, 2.0)),
-    "high": (1.6, (2.0, 1.0), (4.0, 2.5)),
+
+
+class Factors(NamedTuple):
+    """Factors of a quality, by density control for steps and the maximum number of splats."""
+
+    side: float
+    mcmc_steps: float
+    mcmc_splats: float
+    original_steps: float
+    original_splats: float
+
+
+QUALITIES: dict[Quality, Factors] = {
+    "draft": Factors(0.6, 0.4, 0.4, 0.4, 0.8),
+    "normal": Factors(1.0, 1.0, 1.0, 1.0, 2.0),
+    "high": Factors(1.6, 2.0, 1.0, 4.0, 2.5),
 }
 
 #: Dropout is this divided by the number of photos that see the same place, clipped to the maximum;
@@ -45,8 +55,8 @@ MAX_LEARNING_RATE = 3.0
 #: Factor on the steps if cameras are optimized. Learning rates are then 3DGS's: splats that move
 #: fast fit wrong cameras.
 JOINT_STEPS_FACTOR = 2
-#: Maximum splats per pixel of one photo, times (photos / REFERENCE_PHOTOS) ** SPLATS_POWER. With
-#: more splats, few photos are overfitted.
+#: Maximum splats per pixel of one photo, times (photos / REFERENCE_PHOTOS) ** SPLATS_POWER,
+#: times the quality's factor. With more and "mcmc", few photos are overfitted.
 SPLATS_PER_PIXEL = 0.11
 REFERENCE_PHOTOS = 8.0
 SPLATS_POWER = 0.4
@@ -96,10 +106,10 @@ def default_max_size(backend: str, quality: Quality = "normal") -> int:
     Raises:
         IgsrError: the quality is unknown.
     """
-    return round(MAX_SIZES[backend] * _quality(quality)[0])
+    return round(MAX_SIZES[backend] * _factors(quality).side)
 
 
-def _quality(quality: Quality) -> tuple[float, tuple[float, float], tuple[float, float]]:
+def _factors(quality: Quality) -> Factors:
     if quality not in QUALITIES:
         raise IgsrError(f"quality must be one of {', '.join(QUALITIES)}, not {quality!r}.")
     return QUALITIES[quality]
@@ -134,18 +144,18 @@ def _default(
         statistics.spacing_deg > MCMC_SPACING_DEG
         and statistics.visible_fraction >= MCMC_VISIBLE_FRACTION
     )
-    _, mcmc, original = _quality(quality)
-    more_splats = (mcmc if is_mcmc else original)[1]
+    factors = _factors(quality)
     if steps is None:
-        if joint or is_mcmc:
-            photos = statistics.photos
-            usual = min(
-                MAX_STEPS, BASE_STEPS + MORE_STEPS_PER_PHOTO * photos, STEPS_PER_PHOTO * photos
-            )
-            steps = round(mcmc[0] * usual * (JOINT_STEPS_FACTOR if joint else 1))
+        photos = statistics.photos
+        few = min(MAX_STEPS, BASE_STEPS + MORE_STEPS_PER_PHOTO * photos, STEPS_PER_PHOTO * photos)
+        if joint:
+            steps = round(factors.mcmc_steps * few * JOINT_STEPS_FACTOR)
+        elif is_mcmc:
+            steps = round(factors.mcmc_steps * few)
         else:
-            steps = round(original[0] * MAX_STEPS)
+            steps = round(factors.original_steps * MAX_STEPS)
     rate = 1.0 if joint else min(MAX_LEARNING_RATE, max(1.0, math.sqrt(RATE_STEPS / steps)))
+    more_splats = factors.mcmc_splats if is_mcmc else factors.original_splats
     more = (statistics.photos / REFERENCE_PHOTOS) ** SPLATS_POWER
     splats = max(
         SPLATS_PER_PIXEL * statistics.pixels * more,

@@ -9,7 +9,6 @@ error.
 from __future__ import annotations
 
 import warnings
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -63,9 +62,11 @@ def matched_points(views: list[View]) -> tuple[Float64, Float64]:
         matcher = Aliked()
         photos = [Photo(view.name, view.image, mask=view.mask) for view in views]
         with matcher.pool() as threads:
-            learned = list(threads.map(partial(usable_features, matcher), photos))
-            chosen = ([learned[pair[k]] for pair in photo_pairs] for k in (0, 1))
-            matched = threads.map(partial(checked_matches, matcher), *chosen)
+            learned = list(threads.map(lambda photo: usable_features(matcher, photo), photos))
+            matched = threads.map(
+                lambda pair: checked_matches(matcher, learned[pair[0]], learned[pair[1]]),
+                photo_pairs,
+            )
             found += [rows.astype(np.int64) for rows in matched]
         places += [one.xy.astype(np.float64) for one in learned]
     first = np.cumsum([0, *map(len, places)])
