@@ -139,6 +139,12 @@ def test_known_points_are_seeds_and_narrow_the_range_of_depths(monkeypatch):
     assert farthest / nearest < 0.5 * MAX_DEPTH / MIN_DEPTH
     assert seeds.shape == (len(known), 3)
     np.testing.assert_allclose(1.0 / seeds[:, 2], known[:, 2] + DEPTH, rtol=1e-5)
+    # Of a flat scene, the range begins near its points; of a deep one, farther in front of them.
+    corners = np.indices((5, 5)).reshape(2, -1).T / 2.0 - 1.0
+    for behind, fraction in ((0.0, 0.9), (1.0, 1 / (1 + 1.5 * 0.2)), (40.0, 0.6)):
+        depths = np.where(np.arange(25) < 5, DEPTH, DEPTH + behind)
+        points = np.column_stack([corners * 0.05, depths - DEPTH])
+        assert depth_range(points)[0] == pytest.approx(fraction * DEPTH, rel=0.01)
     # Too few points do not count.
     assert depth_range(known[:5])[:2] == depth_range(None)[:2]
     assert depth_range(None)[:2] == pytest.approx((MIN_DEPTH * DEPTH, MAX_DEPTH * DEPTH), rel=0.05)

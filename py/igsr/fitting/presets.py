@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 from igsr._internal.settings import checked_given
 from igsr.errors import IgsrError
@@ -12,22 +12,11 @@ from igsr.fitting.photo_statistics import PhotoStatistics
 from igsr.fitting.settings import FitSettings
 
 Quality: TypeAlias = Literal["draft", "normal", "high"]
-
-
-class Factors(NamedTuple):
-    """Factors of a quality, by density control for steps and the maximum number of splats."""
-
-    side: float
-    mcmc_steps: float
-    mcmc_splats: float
-    original_steps: float
-    original_splats: float
-
-
-QUALITIES: dict[Quality, Factors] = {
-    "draft": Factors(0.6, 0.4, 0.4, 0.4, 0.8),
-    "normal": Factors(1.0, 1.0, 1.0, 1.0, 2.0),
-    "high": Factors(1.6, 2.0, 1.0, 4.0, 2.5),
+#: Factors on the sides of photos, the number of steps and the maximum number of splats.
+QUALITIES: dict[Quality, tuple[float, float, float]] = {
+    "draft": (0.6, 0.4, 0.4),
+    "normal": (1.0, 1.0, 1.0),
+    "high": (1.6, 2.0, 2.5),
 }
 
 #: Dropout is this divided by the number of photos that see the same place, clipped to the maximum;
@@ -55,8 +44,8 @@ MAX_LEARNING_RATE = 3.0
 #: Factor on the steps if cameras are optimized. Learning rates are then 3DGS's: splats that move
 #: fast fit wrong cameras.
 JOINT_STEPS_FACTOR = 2
-#: Maximum splats per pixel of one photo, times (photos / REFERENCE_PHOTOS) ** SPLATS_POWER,
-#: times the quality's factor. With more and "mcmc", few photos are overfitted.
+#: Maximum splats per pixel of one photo, times (photos / REFERENCE_PHOTOS) ** SPLATS_POWER. With
+#: more splats, few photos are overfitted; with "mcmc" also at quality "high".
 SPLATS_PER_PIXEL = 0.11
 REFERENCE_PHOTOS = 8.0
 SPLATS_POWER = 0.4
@@ -106,10 +95,10 @@ def default_max_size(backend: str, quality: Quality = "normal") -> int:
     Raises:
         IgsrError: the quality is unknown.
     """
-    return round(MAX_SIZES[backend] * _factors(quality).side)
+    return round(MAX_SIZES[backend] * _quality(quality)[0])
 
 
-def _factors(quality: Quality) -> Factors:
+def _quality(quality: Quality) -> tuple[float, float, float]:
     if quality not in QUALITIES:
         raise IgsrError(f"quality must be one of {', '.join(QUALITIES)}, not {quality!r}.")
     return QUALITIES[quality]
@@ -144,18 +133,16 @@ def _default(
         statistics.spacing_deg > MCMC_SPACING_DEG
         and statistics.visible_fraction >= MCMC_VISIBLE_FRACTION
     )
-    factors = _factors(quality)
+    _, more_steps, more_splats = _quality(quality)
+    if is_mcmc:
+        more_splats = min(1.0, more_splats)
     if steps is None:
-        photos = statistics.photos
-        few = min(MAX_STEPS, BASE_STEPS + MORE_STEPS_PER_PHOTO * photos, STEPS_PER_PHOTO * photos)
-        if joint:
-            steps = round(factors.mcmc_steps * few * JOINT_STEPS_FACTOR)
-        elif is_mcmc:
-            steps = round(factors.mcmc_steps * few)
-        else:
-            steps = round(factors.original_steps * MAX_STEPS)
+        usual = MAX_STEPS
+        if is_mcmc or joint:
+            photos = statistics.photos
+            usual = min(usual, BASE_STEPS + MORE_STEPS_PER_PHOTO * photos, STEPS_PER_PHOTO * photos)
+        steps = round(more_steps * usual * (JOINT_STEPS_FACTOR if joint else 1))
     rate = 1.0 if joint else min(MAX_LEARNING_RATE, max(1.0, math.sqrt(RATE_STEPS / steps)))
-    more_splats = factors.mcmc_splats if is_mcmc else factors.original_splats
     more = (statistics.photos / REFERENCE_PHOTOS) ** SPLATS_POWER
     splats = max(
         SPLATS_PER_PIXEL * statistics.pixels * more,

@@ -118,6 +118,9 @@ const COARSE_UNTIL: f64 = 0.3;
 /// Final weight of the depth loss as a fraction of the initial weight.
 const DEPTH_DECAY: f64 = 0.01;
 
+/// Steps between two opacity resets of the original control.
+pub(super) const RESET_EVERY: u32 = 3000;
+
 /// Steps until density control first runs, and from one run to the next, at most.
 const REFINE: (u32, u32) = (300, 100);
 
@@ -165,14 +168,15 @@ impl FitConfig {
     }
 
     /// Weight of the mean opacity in the loss at a step (from 0). The original control has it only with
-    /// few photos: with many, a splat is visible in few steps and would fade.
+    /// few photos (with many, a splat is visible in few steps and would fade) and if the fit is too
+    /// short for resets: after one, the pull would remove splats before photos show them again.
     pub(super) fn opacity_pull_at(&self, step: u32, photos: usize) -> f32 {
         // With a stronger pull, a fitted focal length ends farther off.
         let strongest = if self.cameras.is_some() { 1.0 } else { FEW_PHOTOS_PULL };
         let few = strongest * (FEW_PHOTOS / photos as f32).min(1.0);
         let factor = match self.density {
             DensityControl::Mcmc => few.max(1.0),
-            DensityControl::Original if few > 1.0 => few,
+            DensityControl::Original if few > 1.0 && !self.has_resets() => few,
             _ => return 0.0,
         };
         // Adam takes a full step along a pull without gradients. With larger steps, a splat that few
@@ -180,6 +184,21 @@ impl FitConfig {
         let faster =
             self.rates_at(step, 1.0).opacities / self.rates.opacities.max(f32::MIN_POSITIVE);
         factor * MCMC_PULL.0 / faster.max(1.0).sqrt()
+    }
+
+    /// Fraction of the steps after which density control runs no more.
+    pub(super) fn refined_fraction(&self) -> f64 {
+        match self.density {
+            DensityControl::Mcmc => 0.85,
+            DensityControl::Original => 0.5,
+            DensityControl::Fixed => 0.0,
+        }
+    }
+
+    /// Whether opacities are reset in this fit; see [`RESET_EVERY`].
+    fn has_resets(&self) -> bool {
+        self.density == DensityControl::Original
+            && self.refined_fraction() * f64::from(self.steps) > f64::from(RESET_EVERY)
     }
 
     /// Weight of the mean scale in the loss.
@@ -305,6 +324,12 @@ mod tests {
             assert!((mcmc[k] - factor).abs() < 1e-6, "{mcmc:?}");
             assert_eq!(original[k], if k < 4 { mcmc[k] } else { 0.0 });
         }
+        // Resets begin at step 3000 of the first half.
+        let of_steps = |steps| {
+            let density = DensityControl::Original;
+            FitConfig { steps, density, ..FitConfig::default() }.opacity_pull_at(0, 3)
+        };
+        assert_eq!([6000, 6001].map(of_steps), [0.03, 0.0]);
         assert_eq!(pull(DensityControl::Fixed, 3), 0.0);
         let moving = FitConfig {
             density: DensityControl::Mcmc,

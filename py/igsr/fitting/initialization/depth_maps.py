@@ -48,9 +48,12 @@ MAX_DEPTH_MAPS = 24
 #: Range of depths, in units of the distance to the target.
 MIN_DEPTH = 0.25
 MAX_DEPTH = 8.0
-#: The range in units of the depths of known points, if a photo shows enough of them. Points are on
-#: texture: the scene extends in front of and behind them.
-MIN_POINT_DEPTH = 0.6
+#: The range by the depths of known points, if a photo shows enough of them. Points are on texture:
+#: the scene extends in front of and behind them. In front of the nearest points the range extends by
+#: this factor times their distance from the median, both in inverse depths, between these fractions
+#: of their depth. Wrong surfaces close to a camera would hide the scene.
+IN_FRONT = 1.5
+NEAREST_FRACTIONS = (0.6, 0.9)
 MAX_POINT_DEPTH = 4.0
 MIN_KNOWN_POINTS = 20
 
@@ -186,8 +189,9 @@ def _seeds(view: View, known: Float64 | None) -> Float64:
 def _depth_range(seeds: Float64, distance: float) -> tuple[float, float]:
     """The nearest and farthest depth to try, by known points or the target's distance."""
     if len(seeds) >= MIN_KNOWN_POINTS:
-        low, high = np.percentile(seeds[:, 2], [1.0, 99.0])
-        return MIN_POINT_DEPTH * float(low), MAX_POINT_DEPTH * float(high)
+        low, median, high = (float(d) for d in np.percentile(seeds[:, 2], [1.0, 50.0, 99.0]))
+        fraction = 1.0 / (1.0 + IN_FRONT * (1.0 - low / median))
+        return low * float(np.clip(fraction, *NEAREST_FRACTIONS)), MAX_POINT_DEPTH * high
     return MIN_DEPTH * distance, MAX_DEPTH * distance
 
 
