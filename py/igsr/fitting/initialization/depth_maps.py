@@ -49,9 +49,9 @@ MAX_DEPTH_MAPS = 24
 MIN_DEPTH = 0.25
 MAX_DEPTH = 8.0
 #: The range by the depths of known points, if a photo shows enough of them. Points are on texture:
-#: the scene extends in front of and behind them. In front of the nearest points the range extends by
-#: this factor times their distance from the median, both in inverse depths, between these fractions
-#: of their depth. Wrong surfaces close to a camera would hide the scene.
+#: the scene extends in front of and behind them. It begins in front of the nearest points by this
+#: factor times their distance from the median, both in inverse depths, between these fractions of
+#: their depth. Wrong surfaces close to a camera would hide the scene.
 IN_FRONT = 1.5
 NEAREST_FRACTIONS = (0.6, 0.9)
 MAX_POINT_DEPTH = 4.0
