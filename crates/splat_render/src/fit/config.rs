@@ -118,9 +118,6 @@ const COARSE_UNTIL: f64 = 0.3;
 /// Final weight of the depth loss as a fraction of the initial weight.
 const DEPTH_DECAY: f64 = 0.01;
 
-/// Steps between two opacity resets of the original control.
-pub(super) const RESET_EVERY: u32 = 3000;
-
 /// Steps until density control first runs, and from one run to the next, at most.
 const REFINE: (u32, u32) = (300, 100);
 
@@ -167,16 +164,12 @@ impl FitConfig {
         }
     }
 
-    /// Weight of the mean opacity in the loss at a step (from 0). The original control has it only with
-    /// few photos (with many, a splat is visible in few steps and would fade) and if the fit is too
-    /// short for resets: after one, the pull would remove splats before photos show them again.
+    /// Weight of the mean opacity in the loss at a step (from 0). The original control has it instead
+    /// of resets; see [`FitConfig::resets_opacities`].
     pub(super) fn opacity_pull_at(&self, step: u32, photos: usize) -> f32 {
-        // With a stronger pull, a fitted focal length ends farther off.
-        let strongest = if self.cameras.is_some() { 1.0 } else { FEW_PHOTOS_PULL };
-        let few = strongest * (FEW_PHOTOS / photos as f32).min(1.0);
         let factor = match self.density {
-            DensityControl::Mcmc => few.max(1.0),
-            DensityControl::Original if few > 1.0 && !self.has_resets() => few,
+            DensityControl::Mcmc => self.opacity_pull(photos).max(1.0),
+            DensityControl::Original if !self.resets_opacities(photos) => self.opacity_pull(photos),
             _ => return 0.0,
         };
         // Adam takes a full step along a pull without gradients. With larger steps, a splat that few
@@ -186,19 +179,20 @@ impl FitConfig {
         factor * MCMC_PULL.0 / faster.max(1.0).sqrt()
     }
 
-    /// Fraction of the steps after which density control runs no more.
-    pub(super) fn refined_fraction(&self) -> f64 {
-        match self.density {
-            DensityControl::Mcmc => 0.85,
-            DensityControl::Original => 0.5,
-            DensityControl::Fixed => 0.0,
-        }
+    /// Weight of the mean opacity by the number of photos, in units of MCMC's.
+    fn opacity_pull(&self, photos: usize) -> f32 {
+        // With a stronger pull, a fitted focal length ends farther off.
+        let strongest = if self.cameras.is_some() { 1.0 } else { FEW_PHOTOS_PULL };
+        strongest * (FEW_PHOTOS / photos as f32).min(1.0)
     }
 
-    /// Whether opacities are reset in this fit; see [`RESET_EVERY`].
-    fn has_resets(&self) -> bool {
+    /// Whether the original control resets opacities and, after the first reset, prunes splats larger
+    /// than a tenth of the cameras' extent (3DGS). Few photos from similar directions would lose their
+    /// scene, which is far larger than that. They have dropout and a pull on opacities instead. With
+    /// many photos, a splat is visible in few steps and a pull would remove it.
+    pub(super) fn resets_opacities(&self, photos: usize) -> bool {
         self.density == DensityControl::Original
-            && self.refined_fraction() * f64::from(self.steps) > f64::from(RESET_EVERY)
+            && !(self.dropout > 0.0 && self.opacity_pull(photos) > 1.0)
     }
 
     /// Weight of the mean scale in the loss.
@@ -314,9 +308,8 @@ mod tests {
 
     #[test]
     fn opacities_are_pulled_more_with_few_photos() {
-        let pull = |density, photos| {
-            FitConfig { density, ..FitConfig::default() }.opacity_pull_at(0, photos)
-        };
+        let of = |density, dropout| FitConfig { density, dropout, ..FitConfig::default() };
+        let pull = |density, photos| of(density, 0.1).opacity_pull_at(0, photos);
         let counts = [1, 8, 12, 23, 24, 100];
         let mcmc = counts.map(|photos| pull(DensityControl::Mcmc, photos) / 0.01);
         let original = counts.map(|photos| pull(DensityControl::Original, photos) / 0.01);
@@ -324,12 +317,12 @@ mod tests {
             assert!((mcmc[k] - factor).abs() < 1e-6, "{mcmc:?}");
             assert_eq!(original[k], if k < 4 { mcmc[k] } else { 0.0 });
         }
-        // Resets begin at step 3000 of the first half.
-        let of_steps = |steps| {
-            let density = DensityControl::Original;
-            FitConfig { steps, density, ..FitConfig::default() }.opacity_pull_at(0, 3)
-        };
-        assert_eq!([6000, 6001].map(of_steps), [0.03, 0.0]);
+        let resets = counts.map(|n| of(DensityControl::Original, 0.1).resets_opacities(n));
+        assert_eq!(resets, [false, false, false, false, true, true]);
+        // Without dropout, it is 3DGS's control.
+        let plain = of(DensityControl::Original, 0.0);
+        assert!(plain.resets_opacities(3) && plain.opacity_pull_at(0, 3) == 0.0);
+        assert!(!of(DensityControl::Mcmc, 0.0).resets_opacities(100));
         assert_eq!(pull(DensityControl::Fixed, 3), 0.0);
         let moving = FitConfig {
             density: DensityControl::Mcmc,

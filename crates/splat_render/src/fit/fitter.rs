@@ -11,7 +11,7 @@ use rand_pcg::Pcg64;
 use rayon::prelude::*;
 
 use super::cameras::{CameraState, Cameras, PosePrior, scene_distance};
-use super::config::{Background, DensityControl, FitConfig, RESET_EVERY};
+use super::config::{Background, DensityControl, FitConfig};
 use super::density;
 use super::exposures::{ExposureState, Exposures};
 use crate::camera::Camera;
@@ -21,8 +21,12 @@ use crate::fit_device::{FitDevice, FitState, McmcRun, OriginalRun, StepInput};
 use crate::stages::Exposure;
 use crate::target::Target;
 
+/// Part of all steps after which density control runs no more (MCMC; original).
+const REFINE_STOP: (f64, f64) = (0.85, 0.5);
 /// Fraction of the steps after which MCMC reaches the maximum number of splats.
 const MCMC_GROWN: f64 = 0.5;
+/// Steps between two opacity resets of the original control.
+const RESET_EVERY: u32 = 3000;
 
 /// Purpose of a draw; part of its seed.
 #[derive(Clone, Copy)]
@@ -373,11 +377,15 @@ impl Fitter {
     fn control_density(&mut self) -> Result<()> {
         let (step, config) = (self.step, &self.config);
         let (start, every) = config.refine_steps();
-        let active = f64::from(step) < config.refined_fraction() * f64::from(config.steps);
+        let stop = match config.density {
+            DensityControl::Mcmc => REFINE_STOP.0,
+            DensityControl::Original => REFINE_STOP.1,
+            DensityControl::Fixed => 0.0,
+        };
+        let active = f64::from(step) < stop * f64::from(config.steps);
         let refine = active && step >= start && step.is_multiple_of(every);
-        let reset = active
-            && config.density == DensityControl::Original
-            && step.is_multiple_of(RESET_EVERY);
+        let resets = config.resets_opacities(self.schedule.len());
+        let reset = active && resets && step.is_multiple_of(RESET_EVERY);
         if !refine && !reset {
             return Ok(());
         }
@@ -388,7 +396,7 @@ impl Fitter {
             self.splats = self.device.original(&OriginalRun {
                 max_splats: config.max_splats,
                 extent: self.extent,
-                prune_huge: step > RESET_EVERY,
+                prune_huge: resets && step > RESET_EVERY,
                 seed: rng.random(),
             })?;
         }
