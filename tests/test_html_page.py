@@ -1,18 +1,15 @@
 """``report.html`` of a refinement in a browser: its script runs, cameras and pictures appear."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 import scenes
-from refinements import refine, truthful
 
 import igsr
 from igsr.refinement.html_page import write_page
 from igsr.refinement.report import report_of
-from igsr.refinement.results import HeldOutView, Refined, Round, Stop, StopReason
+from igsr.refinement.results import Refined, Stop, StopReason
 from igsr.refinement.settings import RefineSettings
 
 #: Colors of the cameras of photos and of added views.
@@ -35,51 +32,6 @@ def test_the_page_draws_the_cameras(browser, helped):
     pixels = cameras_drawn(browser, helped[1] / "report.html")
     for color in (PHOTOS, ADDED):
         assert near(pixels, color) > 100
-
-
-def test_held_out_photos_are_compared_with_a_slider(browser, few_photos, tmp_path):
-    (done,) = refine(few_photos, 1, truthful, steps=30, out=tmp_path).rounds
-    assert len(done.held_out) == 3
-    assert done.verdict.startswith("3 held-out photos change by ")
-    report = json.loads((tmp_path / "report.json").read_text())
-    rows = report["rounds"][1]["cross_validation"]["held_out"]
-    assert [row["name"] for row in rows] == [view.name for view in done.held_out]
-    assert np.mean([row["psnr_after"] for row in rows]) == pytest.approx(
-        done.validation_after["psnr"]
-    )
-    browser.load(tmp_path / "report.html")
-    sliders = "document.querySelectorAll('.slider')"
-    assert browser.run(f"{sliders}.length") == 3
-    shown = "[...document.querySelectorAll('.slider img')].map(one => one.naturalWidth)"
-    assert browser.run(shown) == [40] * 6
-    over = f"{sliders}[1].querySelector('.over')"
-    assert browser.run(f"getComputedStyle({over}).clipPath") == "inset(0px 0px 0px 50%)"
-    moved = f"(() => {{ const bar = {sliders}[1].querySelector('input'); bar.value = 20; "
-    moved += "bar.dispatchEvent(new Event('input')); "
-    moved += f"return getComputedStyle({over}).clipPath; }})()"
-    assert browser.run(moved) == "inset(0px 0px 0px 20%)"
-
-
-def held_out(gains):
-    """A round with these gains of held-out photos, dB."""
-    picture = np.zeros((2, 2, 3), np.uint8)
-    views = [HeldOutView(f"{g}", picture, picture, picture, 20.0, 20.0 + g) for g in gains]
-    return Round([], [], {}, {}, True, None, None, views)
-
-
-@pytest.mark.parametrize(
-    ("gains", "verdict"),
-    [
-        ([], ""),
-        ([0.5, 0.6], "2 held-out photos are too few to tell gain from chance."),
-        ([0.5, 0.6, 0.4], "3 held-out photos change by +0.50 ± 0.06 dB: more than chance."),
-        ([0.5, -0.6, 0.4], "3 held-out photos change by +0.10 ± 0.35 dB: it may be chance."),
-        ([-0.5, -0.6, -0.4], "3 held-out photos change by -0.50 ± 0.06 dB: more than chance."),
-        ([0.5, 0.6, float("inf")], ""),
-    ],
-)
-def test_the_verdict_compares_the_gain_with_its_error(gains, verdict):
-    assert held_out(gains).verdict == verdict
 
 
 def test_text_is_escaped(tmp_path):

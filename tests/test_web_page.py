@@ -44,9 +44,9 @@ def wait_for(browser, expression, seconds=20.0):
 
 def write_round(folder, number):
     """Write the files of a refinement after a round."""
-    rounds = [{"splats": 300, "test": {"psnr": 20.0 + k}, "accepted": True} for k in range(number)]
+    rounds = [{"splats": 300, "test": {"psnr": 20.0 + k}} for k in range(number)]
     ROUNDS[number].save(folder / "rounds" / str(number) / "scene.ply")
-    rounds.append({"splats": 300, "test": {"psnr": 20.0 + number}, "accepted": True})
+    rounds.append({"splats": 300, "test": {"psnr": 20.0 + number}})
     (folder / "report.json").write_text(json.dumps({"rounds": rounds}))
 
 
@@ -88,7 +88,7 @@ def test_the_page_shows_new_rounds_without_a_reload(browser, tmp_path):
             "round 1, 21.00 dB",
             "round 2, 22.00 dB",
         ]
-        assert texts(browser, "#scores tr:last-child td")[:2] == ["round 2: accepted", "22.00"]
+        assert texts(browser, "#scores tr:last-child td")[:2] == ["round 2", "22.00"]
         check_pictures(browser, ROUNDS[2], three_cameras()[1:2], BLACK)
         choose(browser, "shown", "round-0")
         wait_for(browser, "window.igsr.viewer.main.scene.count === 300")

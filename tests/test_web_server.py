@@ -205,16 +205,11 @@ def test_a_refinement_has_rounds_and_their_scores(tmp_path):
     for number in (0, 1, 10):
         model(0).save(tmp_path / "rounds" / str(number) / "scene.ply")
     (tmp_path / "rounds" / "x").mkdir()
-    validation = {"before": {"psnr": 21.0}, "after": {"psnr": 20.5}}
-    rounds = [
-        {"splats": 400, "test": {"psnr": 20.0}, "accepted": True},
-        {"splats": None, "test": None, "accepted": False, "cross_validation": validation},
-    ]
+    rounds = [{"splats": 400, "test": {"psnr": 20.0}}, {"splats": 500, "test": None}]
     (tmp_path / "report.json").write_text(json.dumps({"rounds": rounds}))
     checkpoint = tmp_path / "checkpoints" / "whole-round2.npz"
     checkpoint.parent.mkdir()
     checkpoint.write_bytes(b"")
-    (tmp_path / "checkpoints" / "fold0.npz").write_bytes(b"")
     with served(tmp_path) as server:
         state = state_of(server)
         assert [(one["id"], one["label"]) for one in state["models"]] == [
@@ -224,8 +219,8 @@ def test_a_refinement_has_rounds_and_their_scores(tmp_path):
             ("checkpoint", "round 2, being fitted"),
         ]
         assert state["scores"]["rows"] == [
-            ["first fit", "20.00", "–", "400"],
-            ["round 1: not accepted", "–", "21.00 → 20.50", "–"],
+            ["first fit", "20.00", "400"],
+            ["round 1", "–", "500"],
         ]
         os.utime(checkpoint, (1e9, 1e9))
         assert state_of(server)["newest"] == "round-10"
@@ -246,7 +241,7 @@ def test_two_scenes_have_their_own_models(tmp_path, scene):
         "",
         "[]",
         "{",
-        '{"rounds": [3, null, {"test": [], "cross_validation": {"before": 1}}]}',
+        '{"rounds": [3, null, {"test": [], "splats": {"before": 1}}]}',
         '{"rounds": {}, "psnr": "high", "protocol": 7, "train": []}',
         '{"psnr": NaN, "text": 3, "done": 1, "background": [1, 2]}',
         '{"psnr": 1' + 400 * "0" + ', "text": "x", "done": 1e999, "background": [1, 2, "3"]}',

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-import refinements
 import scenes
 import textured_room as room
 from capture_files import opengl_pose, save, write_json
@@ -28,7 +27,6 @@ from igsr.capture.write_colmap import write_colmap
 from igsr.capture.write_transforms import write_transforms
 from igsr.errors import IgsrError
 from igsr.geometry.similarity import similarity_between
-from igsr.refinement import rounds
 
 WIDTH, HEIGHT = 256, 128
 SIDES = ["front", "right", "back", "left", "up", "down"]
@@ -435,20 +433,3 @@ def test_a_joint_fit_moves_whole_panoramas(capture):
     np.testing.assert_allclose(within[0], within[1], atol=1e-9)
     with pytest.raises(IgsrError, match='whose focal length is known; leave focal "fixed"'):
         scenes.fit(loaded, steps=2, focal="shared")
-
-
-def test_folds_hold_whole_panoramas_out(capture, monkeypatch):
-    loaded = load_capture(capture, 32)
-    rigs = {view.rig for view in loaded.views}
-    held_out = []
-    fit_photos = rounds.fit_photos
-
-    def watched(context, fold, photos, *rest):
-        assert len(photos) == 18
-        held_out.append(rigs - {photo.rig for photo in photos})
-        return fit_photos(context, fold, photos, *rest)
-
-    monkeypatch.setattr(rounds, "fit_photos", watched)
-    refinements.refine(loaded, 1, refinements.lying, steps=10)
-    assert [len(fold) for fold in held_out] == [1, 1, 1]
-    assert len(set.union(*held_out)) == 3

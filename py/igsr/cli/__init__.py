@@ -30,7 +30,7 @@ class _Commands(LazyGroup):
         "refine": LazyCommand(
             "igsr.cli.refine",
             "refine_command",
-            "Fit few photos, then refit with denoised novel views that pass cross-validation.",
+            "Fit few photos, then refit with denoised novel views.",
         ),
         "render": LazyCommand(
             "igsr.cli.render", "render_command", "Render pictures, or a video around the scene."

@@ -42,7 +42,7 @@ def refine_command(
     out: Annotated[Path, option("--out", help="Folder for the scene and its report.")],
     example: ExampleOption = False,
     rounds: Annotated[
-        str, option("--rounds", metavar="auto|N", help="Maximum number of rounds; auto: 4.")
+        str, option("--rounds", metavar="auto|N", help="Maximum number of rounds; auto: 1, 2 or 4 by quality.")
     ] = "auto",
     quality: QualityOption = "normal",
     max_size: FitSizeOption = None,
@@ -62,10 +62,7 @@ def refine_command(
     denoiser: DenoiserOption = None,
     seed: SeedOption = 0,
 ) -> None:
-    """Fit few PHOTOS; add denoised novel views and refit.
-
-    A round is accepted only if it improves cross-validation scores.
-    """
+    """Fit few PHOTOS; add denoised novel views and refit."""
     with error_messages(lambda: f"Interrupted; the same command with --resume continues in {out}."):
         from igsr.refinement import refine, round_denoiser
 
@@ -103,8 +100,7 @@ def _summary(refined: Refined, report: dict[str, Any], out: Path) -> dict[str, A
     """The object that --json prints."""
     assert refined.stop is not None
     return {
-        "accepted": sum(done.accepted for done in refined.rounds),
-        "tried": len(refined.rounds),
+        "rounds": len(refined.rounds),
         "stop_reason": refined.stop.reason.value,
         "stopped": str(refined.stop),
         "test": _tests(refined) or None,
@@ -120,21 +116,14 @@ def _summary(refined: Refined, report: dict[str, Any], out: Path) -> dict[str, A
 
 
 def _tests(refined: Refined) -> list[dict[str, float | None]]:
-    """Scores of the test views after the first fit and after each accepted round."""
-    tests = [refined.first_test, *(done.test for done in refined.rounds if done.accepted)]
+    """Scores of the test views after the first fit and after each round."""
+    tests = [refined.first_test, *(done.test for done in refined.rounds)]
     return [test for test in tests if test]
 
 
 def _print_summary(refined: Refined, report: dict[str, Any], out: Path) -> None:
-    accepted = sum(done.accepted for done in refined.rounds)
     console = output_console()
-    console.print(
-        f"{accepted} of {len(refined.rounds)} rounds accepted; stopped: {refined.stop}",
-        markup=False,
-    )
-    for number, done in enumerate(refined.rounds, 1):
-        if done.gain is not None:
-            console.print(f"Round {number}: {done.verdict}", markup=False)
+    console.print(f"{len(refined.rounds)} rounds; stopped: {refined.stop}", markup=False)
     by_round = " -> ".join(f"{test['psnr']:.2f}" for test in _tests(refined))
     if by_round:
         console.print(f"PSNR of the test views by round: {by_round} dB")

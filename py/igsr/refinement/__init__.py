@@ -1,4 +1,4 @@
-"""Iterative refinement: fit, cross-validate, render novel views, denoise, select, refit."""
+"""Iterative refinement: fit, render novel views, denoise, select, refit."""
 
 from __future__ import annotations
 

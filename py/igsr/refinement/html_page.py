@@ -1,7 +1,6 @@
-"""``report.html``: one page, with everything inside, that shows what a refinement did.
+"""``report.html``: a page without other files that shows a refinement.
 
-The page itself is ``templates/report.html.jinja``; this module says what is put into it. All text
-is escaped.
+This module computes the variables of ``templates/report.html.jinja``. All text is escaped.
 """
 
 from __future__ import annotations
@@ -28,11 +27,13 @@ from igsr.evaluation.report_page import (
 from igsr.evaluation.scores import ScoredView, default_background, over_background
 from igsr.refinement.novel_views import NovelView
 from igsr.refinement.progress import STAGE_NAMES
-from igsr.refinement.results import HELD_OUT_SIDE_PX, HeldOutView, Refined
+from igsr.refinement.results import Refined
 from igsr.refinement.selection import MIN_CONFIDENCE, MIN_GAIN, Candidate, Rejected
 
 #: Longest side of photos and of novel views on the page, pixels.
 THUMBNAIL_PX, VIEW_PX = 160, 320
+#: Digits after the point of each score.
+SCORE_DIGITS = {"psnr": 2, "ssim": 4, "flip": 4, "cc_psnr": 2, "cc_ssim": 4}
 STAGES = {"cameras": "find cameras", "load": "load photos", **STAGE_NAMES}
 
 
@@ -52,7 +53,6 @@ def write_page(
     """
     background = default_background(refined.capture)
     name = refined.capture.path.name or "photos"
-    validated = [done for done in refined.rounds if done.validation_after]
     tests = [refined.first_test, *(done.test for done in refined.rounds)]
     variables = {
         "name": name,
@@ -68,17 +68,10 @@ def write_page(
         "splats": len(refined.splats),
         "stop": refined.stop,
         "score_rows": _score_rows(refined),
-        "validation_psnr": [
-            *(done.validation_before["psnr"] for done in validated[:1]),
-            *(done.validation_after["psnr"] for done in validated),
-        ],
         "test_psnr": [test["psnr"] for test in tests if test],
         "cameras": _cameras(refined),
         "rounds": [
             {
-                "accepted": done.accepted,
-                "verdict": done.verdict,
-                "held_out": [_held_out(view) for view in done.held_out],
                 "selected": [_selected(candidate) for candidate in done.selected],
                 "rejected": _rejected(done.rejected),
             }
@@ -101,32 +94,17 @@ def write_page(
 
 
 def _score_rows(refined: Refined) -> list[dict[str, Any]]:
-    """Lines of the table of scores: held-out photos before and after a round, and test views."""
+    """Scores of the test views by round; no line without test views."""
+    models = [(refined.first_test, refined.first)]
+    models += [(done.test, done.splats) for done in refined.rounds]
     rows = []
-    if refined.first_test:
-        rows.append(_score_row("0, test views", refined.first_test, len(refined.first)))
-    for count, done in enumerate(refined.rounds, 1):
-        splats = "" if done.splats is None else len(done.splats)
-        if done.validation_after:
-            before = _score_row(f"{count}, held-out photos before", done.validation_before, "")
-            after = _score_row(f"{count}, held-out photos after", done.validation_after, splats)
-            after["accepted"] = done.accepted
-            after["verdict"] = "accepted" if done.accepted else "not accepted"
-            rows += [before, after]
-        else:
-            rows.append(_score_row(f"{count}, not cross-validated", {}, splats))
-        if done.test:
-            rows.append(_score_row(f"{count}, test views", done.test, splats))
+    for count, (scores, splats) in enumerate(models):
+        if scores:
+            row: dict[str, Any] = {"label": str(count), "splats": len(splats)}
+            for name, digits in SCORE_DIGITS.items():
+                row[name] = number(scores.get(name), digits)
+            rows.append(row)
     return rows
-
-
-def _score_row(
-    label: str, scores: dict[str, float] | dict[str, float | None], splats: int | str
-) -> dict[str, Any]:
-    row: dict[str, Any] = {"label": label, "splats": splats, "verdict": ""}
-    for name, digits in (("psnr", 2), ("ssim", 4), ("flip", 4), ("cc_psnr", 2), ("cc_ssim", 4)):
-        row[name] = number(scores.get(name), digits)
-    return row
 
 
 def _selected(candidate: Candidate) -> dict[str, Any]:
@@ -138,17 +116,6 @@ def _selected(candidate: Candidate) -> dict[str, Any]:
         "render": jpeg(candidate.render, VIEW_PX),
         "denoised": jpeg(candidate.denoised, VIEW_PX),
         "confidence": jpeg(confidence, VIEW_PX),
-    }
-
-
-def _held_out(view: HeldOutView) -> dict[str, Any]:
-    return {
-        "name": view.name,
-        "psnr_before": view.psnr_before,
-        "psnr_after": view.psnr_after,
-        "photo": jpeg(view.photo, HELD_OUT_SIDE_PX),
-        "before": jpeg(view.before, HELD_OUT_SIDE_PX),
-        "after": jpeg(view.after, HELD_OUT_SIDE_PX),
     }
 
 
@@ -168,7 +135,7 @@ def _place(view: NovelView) -> str:
 def _cameras(refined: Refined) -> list[tuple[int, list[list[float]]]]:
     """Cameras that the page's script draws; photos and added views determine the frame."""
     photos = [view.camera for view in refined.capture.train_views]
-    added = [one.view.camera for done in refined.rounds if done.accepted for one in done.selected]
+    added = [one.view.camera for done in refined.rounds for one in done.selected]
     rejected = [one.view.camera for one in _last_rejected(refined)]
     kinds = [(REJECTED, rejected), (PHOTO, photos), (ADDED, added)]
     return drawn_cameras(kinds, [*photos, *added])

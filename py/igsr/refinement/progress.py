@@ -10,7 +10,6 @@ from igsr.run import Run
 #: Stages as events name them.
 STAGE_NAMES: dict[str, str] = {
     "fit": "fit photos",
-    "cross_validate": "cross-validate",
     "novel_views": "denoise novel views",
     "refit": "refit with novel views",
     "test": "score test views",

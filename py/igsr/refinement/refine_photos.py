@@ -1,8 +1,7 @@
 """``refine``: fit photos; then add denoised novel views and refit, in rounds.
 
-The loop of the paper's Figure 1, with two differences. Which novel views are added, and how much
-each of their pixels counts, is decided without the true pictures. And a round is done only if
-cross-validation accepts it: if folds of the photos improve on the photos that they hold out.
+The loop of the paper's Figure 1, except that the choice of novel views and the weights of their
+pixels need no true pictures.
 """
 
 from __future__ import annotations
@@ -34,14 +33,6 @@ from igsr.fitting.followed_run import FollowedRun
 from igsr.fitting.photo_statistics import photo_statistics
 from igsr.fitting.presets import Quality, default_max_size
 from igsr.fitting.settings import ExposureMode, TransientMode
-from igsr.refinement.cross_validation import (
-    MIN_PHOTOS,
-    Fold,
-    Validation,
-    fit_folds,
-    fold_photos,
-    validate,
-)
 from igsr.refinement.novel_views import novel_views
 from igsr.refinement.progress import RefineProgress
 from igsr.refinement.report import parts_so_far, write_refinement
@@ -53,8 +44,8 @@ from igsr.refinement.rounds import (
     Reconstruction,
     Select,
     denoise_views,
+    error_increase,
     fit_all,
-    make_context,
     propose_views,
     refit,
     score_test_views,
@@ -62,10 +53,14 @@ from igsr.refinement.rounds import (
 )
 from igsr.refinement.selection import Rejected, select_views
 from igsr.refinement.settings import AUTO, RefineSettings
+from igsr.rendering.backdrop import wants_backdrop
 from igsr.run import Run, open_run
 
 #: "auto" does no round if this many photos see the same place: rounds gained nothing there.
 ENOUGH_PHOTOS = 30.0
+#: No round is done if denoising raises the RMSE of renders of the photos by more than this
+#: fraction. The denoiser of igsr raises it by up to 0.3, because fits reproduce their photos well.
+MAX_ERROR_INCREASE = 0.5
 
 
 def refine(
@@ -77,7 +72,6 @@ def refine(
     quality: Quality = "normal",
     exposure: ExposureMode = "off",
     transients: TransientMode = "auto",
-    cross_validate: bool = True,
     denoiser: Denoiser | None = None,
     propose: Propose = novel_views,
     select: Select = select_views,
@@ -97,18 +91,17 @@ def refine(
     Args:
         photos: a capture; or a path: a folder of photos or a video, whose cameras are found if it
             has none.
-        rounds: maximum number of rounds; "auto" stops when a round does not help, after four
-            rounds, or at once if 30 photos see the same place.
+        rounds: maximum number of rounds; "auto" is 1, 2 or 4 for quality "draft", "normal" or
+            "high", and none if 30 photos see the same place.
         out: folder for scene.ply, scene.html, cameras.json, report.html, report.json, views.png,
             rounds/, checkpoints/, and cameras.npz with found cameras; written after every round.
             None writes nothing.
         steps: number of optimizer steps of each fit; None chooses by the photos.
-        quality: "draft", "normal" or "high": size of photos, number of steps and splats.
+        quality: "draft", "normal" or "high": size of photos, number of steps, splats and rounds.
         exposure: "on", "off" or "auto": whether the first fit optimizes exposures, as ``igsr.fit``;
             later fits see the photos without them.
         transients: "on", "off" or "auto": whether the first fit masks transient objects, as
             ``igsr.fit``; later fits use its masks.
-        cross_validate: accept a round only if it improves cross-validation scores.
         denoiser: denoises novel views; None is ``round_denoiser()``.
         propose: proposes the cameras of novel views.
         select: selects the denoised views to add.
@@ -135,7 +128,6 @@ def refine(
         steps=steps,
         backend=backend,
         seed=seed,
-        cross_validate=cross_validate,
         exposure=exposure,
         transients=transients,
         quality=quality,
@@ -172,16 +164,17 @@ def refine(
         checkpoints = _prepared_folder(run)
         if followed is not None:
             followed.show(capture, default_background(capture))
-        context = make_context(
-            capture,
-            settings,
-            name,
-            denoiser,
-            propose,
-            select,
-            checkpoints,
-            resume,
-            RefineProgress(run, _work(capture, settings)),
+        context = Context(
+            capture=capture,
+            settings=settings,
+            backend=name,
+            denoiser=denoiser,
+            propose=propose,
+            select=select,
+            has_backdrop=wants_backdrop(capture.train_views),
+            checkpoints=checkpoints,
+            resume=resume,
+            progress=RefineProgress(run, 1.0 + settings.most_rounds * (1.0 + NOVEL_VIEWS_WORK)),
         )
         return _run_rounds(context, run, tuple(loaded.not_placed))
 
@@ -201,7 +194,7 @@ def round_denoiser(weights: str | os.PathLike[str] | None = None) -> NetworkDeno
 
 
 def _run_rounds(context: Context, run: Run, not_placed: tuple[str, ...]) -> Refined:
-    """Fit all photos, and do rounds until one is rejected or none is left."""
+    """Fit all photos, and do rounds until none is left or no novel view is selected."""
     context, whole = fit_all(context)
     test = score_test_views(context, whole.shown)
     refined = Refined(
@@ -215,7 +208,6 @@ def _run_rounds(context: Context, run: Run, not_placed: tuple[str, ...]) -> Refi
         seconds={},
         not_placed=not_placed,
     )
-    folds: list[Fold] = []
     while True:
         refined = _write(context, run, refined)
         context.progress.round += 1
@@ -223,19 +215,6 @@ def _run_rounds(context: Context, run: Run, not_placed: tuple[str, ...]) -> Refi
         if stop is not None:
             refined = replace(refined, stop=stop)
             break
-        validated = Validation()
-        if context.settings.cross_validate:
-            # Before the whole fit renders anything, so that a rejected round costs less.
-            folds = folds or fit_folds(context, whole.photos)
-            validated, folds = validate(context, folds)
-            if not validated.selected:
-                refined = _without_round(refined, validated.rejected)
-                break
-            if not validated.accepted:
-                refined = _with_round(refined, validated, [], [], None, None)
-                stop = Stop(StopReason.NOT_ACCEPTED, context.progress.round)
-                refined = replace(refined, stop=stop)
-                break
         novel = propose_views(context, whole)
         candidates = denoise_views(context, whole, [*novel, *whole.added])
         again = candidates[len(novel) :]
@@ -243,9 +222,10 @@ def _run_rounds(context: Context, run: Run, not_placed: tuple[str, ...]) -> Refi
         if not selected:
             refined = _without_round(refined, rejected)
             break
-        whole = refit(context, whole, selected, again, "refit")
+        whole = refit(context, whole, selected, again)
         test = score_test_views(context, whole.shown)
-        refined = _with_round(refined, validated, selected, rejected, whole, test)
+        done = Round(selected, rejected, whole.shown, test)
+        refined = replace(refined, splats=whole.shown, rounds=[*refined.rounds, done])
     return _write(context, run, refined)
 
 
@@ -257,32 +237,10 @@ def _stop_before(context: Context, whole: Reconstruction) -> Stop | None:
     overlap = photo_statistics(whole.photos).overlap
     if settings.rounds == AUTO and overlap >= ENOUGH_PHOTOS:
         return Stop(StopReason.ENOUGH_PHOTOS, round(overlap))
-    if settings.cross_validate and len({view.photo for view in whole.photos}) < MIN_PHOTOS:
-        return Stop(StopReason.TOO_FEW_PHOTOS, MIN_PHOTOS)
+    increase = error_increase(context, whole) if context.progress.round == 1 else 0.0
+    if increase > MAX_ERROR_INCREASE:
+        return Stop(StopReason.HARMFUL_DENOISER, round(100.0 * increase))
     return None
-
-
-def _with_round(
-    refined: Refined,
-    validated: Validation,
-    selected: list[Any],
-    rejected: list[Rejected],
-    whole: Reconstruction | None,
-    test: dict[str, float | None] | None,
-) -> Refined:
-    """The result with one more round; ``whole`` is None if it was rejected."""
-    done = Round(
-        selected,
-        rejected,
-        validated.before,
-        validated.after,
-        whole is not None,
-        None if whole is None else whole.shown,
-        test,
-        validated.held_out,
-    )
-    splats = refined.splats if whole is None else whole.shown
-    return replace(refined, splats=splats, rounds=[*refined.rounds, done])
 
 
 def _without_round(refined: Refined, rejected: list[Rejected]) -> Refined:
@@ -302,15 +260,6 @@ def _write(context: Context, run: Run, refined: Refined) -> Refined:
     return refined
 
 
-def _work(capture: Capture, settings: RefineSettings) -> float:
-    """The maximum work of a refinement, in units of a fit to all photos."""
-    fits, novel = 1.0, NOVEL_VIEWS_WORK
-    if settings.cross_validate:
-        small = fold_photos(capture.train_views)
-        fits, novel = fits + small.fit_work, novel + small.novel_views_work
-    return fits + settings.most_rounds * (fits + novel)
-
-
 def _prepared_folder(run: Run) -> Path | None:
     """Remove what an earlier run left, or read its times to resume; the checkpoints' folder."""
     if run.out is None:
@@ -325,10 +274,9 @@ def _prepared_folder(run: Run) -> Path | None:
     # A later resume must not use fits of an earlier run.
     with contextlib.suppress(OSError):
         (run.out / "report.json").unlink()
-    for fit in ("whole", "fold[0-9]"):
-        for pattern in (f"{fit}.npz", f"{fit}-round[0-9]*.npz"):
-            for path in checkpoints.glob(pattern):
-                path.unlink(missing_ok=True)
+    for pattern in ("whole.npz", "whole-round[0-9]*.npz"):
+        for path in checkpoints.glob(pattern):
+            path.unlink(missing_ok=True)
     return checkpoints
 
 

@@ -31,7 +31,7 @@ from igsr.run import Run
 from igsr.splats import Splats
 
 #: Format number of ``report.json``.
-FORMAT = 3
+FORMAT = 4
 #: Files of a round.
 ROUND_FILES = ("scene.ply", "view-*.before.png", "view-*.after.png", "view-*.confidence.png")
 
@@ -39,12 +39,12 @@ ROUND_FILES = ("scene.ply", "view-*.before.png", "view-*.after.png", "view-*.con
 def write_refinement(run: Run, refined: Refined, settings: RefineSettings) -> None:
     """Write the files of a refinement so far.
 
-    * ``scene.ply``: the last accepted model; ``cameras.json``: the photos' cameras.
+    * ``scene.ply``: the last model; ``cameras.json``: the photos' cameras.
     * ``rounds/N/scene.ply``: the model of each round; 0 is the fit to the photos alone.
     * ``rounds/N/view-K.{before,after,confidence}.png``: the novel views that the round added:
       renders, denoised renders and confidence weights (white is 1).
     * ``views.png``: test views, or fitted photos if there are none, before the first round and
-      after the last accepted one; without an accepted round, photos, renders and errors.
+      after the last; without a round, photos, renders and errors.
 
     Such files of an earlier run are removed. Scores of fitted photos are computed only at the end.
 
@@ -56,8 +56,7 @@ def write_refinement(run: Run, refined: Refined, settings: RefineSettings) -> No
     written = [_save(refined.first, out / "rounds" / "0" / "scene.ply")]
     for number, done in enumerate(refined.rounds, 1):
         folder = out / "rounds" / str(number)
-        if done.splats is not None:
-            written.append(_save(done.splats, folder / "scene.ply"))
+        written.append(_save(done.splats, folder / "scene.ply"))
         for k, candidate in enumerate(done.selected):
             written += _write_view(folder, k, candidate)
     _remove_others(out / "rounds", set(written))
@@ -84,8 +83,7 @@ def report_of(
         parts: time and memory of each stage.
         train: "psnr", "ssim", "views" and "of" of fitted photos, if they are scored.
     """
-    accepted = [done.test for done in refined.rounds if done.accepted]
-    test = [refined.first_test, *accepted][-1]
+    test = [refined.first_test, *(done.test for done in refined.rounds)][-1]
     limit = None
     if train is not None:
         limit = limit_of(train["psnr"], None if test is None else test["psnr"]).plain()
@@ -123,24 +121,9 @@ def parts_so_far(out: Path) -> dict[str, Usage]:
 
 def _round_row(done: Round) -> dict[str, Any]:
     return {
-        "splats": None if done.splats is None else len(done.splats),
+        "splats": len(done.splats),
         "test": done.test,
-        "accepted": done.accepted,
         "candidates": len(done.selected) + len(done.rejected),
-        "cross_validation": {
-            "before": done.validation_before,
-            "after": done.validation_after,
-            "psnr_gain": None if done.gain is None else done.gain[0],
-            "psnr_gain_standard_error": None if done.gain is None else done.gain[1],
-            "held_out": [
-                {
-                    "name": view.name,
-                    "psnr_before": view.psnr_before,
-                    "psnr_after": view.psnr_after,
-                }
-                for view in done.held_out
-            ],
-        },
         "selected": _view_rows(done.selected),
         "rejected": _view_rows(done.rejected),
     }
@@ -182,7 +165,7 @@ def _scored(refined: Refined, backend: Backend) -> tuple[dict[str, Any] | None, 
 
 def _write_views(path: Path, refined: Refined, shown: list[ScoredView], backend: Backend) -> None:
     """Write ``views.png``."""
-    if not any(done.accepted for done in refined.rounds):
+    if not refined.rounds:
         save_sheet(path, contact_sheet(shown))
         return
     names = {one.name for one in shown}

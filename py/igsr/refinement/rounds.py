@@ -1,6 +1,6 @@
 """The steps of a round: propose novel views, denoise them, select some, refit.
 
-The whole fit and the folds of cross-validation take the same steps. Nothing is changed in place.
+Nothing is changed in place.
 """
 
 from __future__ import annotations
@@ -15,18 +15,16 @@ import numpy as np
 from igsr._internal.choices import FitBackend
 from igsr._internal.event import Event
 from igsr.capture import Camera, Capture, PseudoView, View
-from igsr.capture.downscaling import resized_tracks
-from igsr.denoiser import Denoiser, photo_support, render_buffers
+from igsr.denoiser import Denoiser, denoise, photo_support, render_buffers
 from igsr.evaluation.scores import (
     METRICS,
     default_background,
     evaluate,
     known_background,
+    over_background,
 )
 from igsr.fitting.fit_capture import fit_capture
 from igsr.fitting.fitter import with_train_exposures, without_exposures
-from igsr.fitting.photo_statistics import photo_statistics
-from igsr.fitting.presets import settings_for
 from igsr.fitting.result import FitResult
 from igsr.refinement.cut_highlights import with_cut_highlights
 from igsr.refinement.near_sources import NearSources
@@ -35,16 +33,16 @@ from igsr.refinement.progress import RefineProgress
 from igsr.refinement.results import MeanScores, Stage
 from igsr.refinement.selection import Candidate, Rejected, denoised_candidate, rejected
 from igsr.refinement.settings import RefineSettings
-from igsr.rendering.backdrop import wants_backdrop, with_backdrop
+from igsr.rendering.backdrop import with_backdrop
 from igsr.splats import Splats
 
 #: Novel views rendered in a round, and the maximum number that is added.
 CANDIDATES = 24
 MAX_SELECTED = 16
+#: Maximum number of photos whose renders are denoised to check the denoiser.
+CHECKED_PHOTOS = 8
 #: Time of rendering and denoising novel views, as a fraction of a fit's time.
 NOVEL_VIEWS_WORK = 0.4
-#: Settings of the default preset that all fits of a refinement share.
-SHARED_SETTINGS = ("steps", "sh_degree", "density", "learning_rate", "dropout", "coarse_to_fine")
 
 #: Proposes novel views from the splats, the known cameras, a maximum number and the backend.
 Propose = Callable[[Splats, Sequence[Camera], int, FitBackend], Sequence[NovelView]]
@@ -54,15 +52,13 @@ Select = Callable[[Sequence[Candidate], int], list[Candidate]]
 
 @dataclass(frozen=True, eq=False)
 class Context:
-    """What all rounds and folds of a refinement share.
+    """What all rounds of a refinement share.
 
     Attributes:
         capture: the photos; its train views have the exposures that the first fit found.
         settings: of the refinement.
         backend: "cpu" or "gpu".
         denoiser, propose, select: see ``refine``.
-        fit_settings: shared settings of all fits, chosen for all photos.
-        max_splats: of the whole fit.
         has_backdrop: whether scenes get a backdrop before they are scored and written.
         checkpoints: folder of the fits' checkpoints, or None.
         resume: whether fits continue from their checkpoints.
@@ -75,8 +71,6 @@ class Context:
     denoiser: Denoiser
     propose: Propose
     select: Select
-    fit_settings: dict[str, Any]
-    max_splats: int
     has_backdrop: bool
     checkpoints: Path | None
     resume: bool
@@ -98,56 +92,16 @@ class Reconstruction:
     """Splats fitted to photos and to the novel views that rounds have added.
 
     Attributes:
-        name: "whole", or "fold0", "fold1" ...; names the checkpoints.
         photos: the fitted photos, with exposures undone and transient objects masked.
-        share: their pixels as a fraction of those of all photos; scales the number of splats.
-        steps: fraction of the whole fit's steps.
         splats: after the last fit, without a backdrop, so that holes show.
         shown: ``splats`` with the backdrop, if the scene has one: scored and written.
         added: novel views that rounds have added.
     """
 
-    name: str
     photos: list[View]
-    share: float
-    steps: float
     splats: Splats
     shown: Splats
     added: tuple[NovelView, ...] = ()
-
-
-def make_context(
-    capture: Capture,
-    settings: RefineSettings,
-    backend: FitBackend,
-    denoiser: Denoiser,
-    propose: Propose,
-    select: Select,
-    checkpoints: Path | None,
-    resume: bool,
-    progress: RefineProgress,
-) -> Context:
-    """Choose the settings of the fits.
-
-    Folds have fewer photos and steps, but the settings that are chosen for all photos.
-    """
-    chosen = settings_for(
-        photo_statistics(capture.train_views), settings.quality, steps=settings.steps
-    ).plain()
-    return Context(
-        capture,
-        settings,
-        backend,
-        denoiser,
-        propose,
-        select,
-        {name: chosen[name] for name in SHARED_SETTINGS},
-        int(chosen["max_splats"]),
-        wants_backdrop(capture.train_views),
-        checkpoints,
-        resume,
-        progress,
-    )
 
 
 def fit_all(context: Context) -> tuple[Context, Reconstruction]:
@@ -163,6 +117,7 @@ def fit_all(context: Context) -> tuple[Context, Reconstruction]:
         "whole",
         "fit",
         context.capture.train_views,
+        seed=settings.seed,
         exposure=settings.exposure,
         transients=settings.transients,
     )
@@ -179,16 +134,7 @@ def fit_all(context: Context) -> tuple[Context, Reconstruction]:
     )
     shown = _with_backdrop(context, result.splats, photos)
     context = replace(context, has_backdrop=shown is not result.splats)
-    return context, Reconstruction("whole", photos, 1.0, 1.0, result.splats, shown)
-
-
-def fit_photos(
-    context: Context, name: str, photos: list[View], share: float, steps: float
-) -> Reconstruction:
-    """Fit some photos; see ``Reconstruction`` for the arguments."""
-    splats = _fit(context, name, "fit", photos, share, steps).splats
-    shown = _with_backdrop(context, splats, photos)
-    return Reconstruction(name, photos, share, steps, splats, shown)
+    return context, Reconstruction(photos, result.splats, shown)
 
 
 def propose_views(context: Context, fitted: Reconstruction) -> list[NovelView]:
@@ -211,8 +157,32 @@ def denoise_views(
         near = sources.of(view.camera)
         candidates.append(denoised_candidate(view, buffers, near, context.denoiser))
         context.progress.report("novel_views")
-    context.progress.add_work(NOVEL_VIEWS_WORK * fitted.share)
+    context.progress.add_work(NOVEL_VIEWS_WORK)
     return candidates
+
+
+def error_increase(context: Context, fitted: Reconstruction) -> float:
+    """By which fraction denoising increases the RMSE of renders of the photos; 0 if it does not.
+
+    The denoiser does not get the photo itself.
+    """
+    splats, photos, backend = fitted.splats, fitted.photos, context.backend
+    support = photo_support(splats, photos, backend)
+    sources = NearSources(splats, photos, context.background, backend)
+    before, after = [], []
+    for photo in photos[:: -(-len(photos) // CHECKED_PHOTOS)]:
+        camera = photo.camera
+        buffers = render_buffers(splats, camera, support, context.known_background, backend)
+        others = [source for source in sources.of(camera) if source.camera is not camera]
+        denoised, _ = denoise(buffers, others, context.denoiser)
+        true = over_background(photo.image, context.background) / np.float32(255.0)
+        shown = np.ones(true.shape[:2], np.bool_) if photo.mask is None else photo.mask
+        render = np.clip(np.nan_to_num(buffers.color), 0.0, 1.0)
+        before.append(np.square(render - true)[shown])
+        after.append(np.square(denoised - true)[shown])
+        context.progress.report("novel_views")
+    old, new = (float(np.concatenate(errors).mean()) for errors in (before, after))
+    return max(0.0, np.sqrt(new / max(old, 1e-12)) - 1.0)
 
 
 def select_candidates(
@@ -229,23 +199,20 @@ def refit(
     fitted: Reconstruction,
     selected: Sequence[Candidate],
     added_before: Sequence[Candidate],
-    stage: Stage,
 ) -> Reconstruction:
     """Fit photos and novel views from the initialization of the photos.
 
     A fit that continued from the splats would keep their errors in places that no photo shows.
-    A whole fit has another seed in each round: the same draws would err where the views err. A
-    fold keeps its seed, so that chance is the same before and after its round.
+    Each round has another seed: the same draws would err where the views err.
 
     Args:
         context: of the refinement.
         fitted: the reconstruction so far.
         selected: novel views to add.
         added_before: novel views of earlier rounds, denoised again.
-        stage: "refit" or "cross_validate".
     """
     number = context.progress.round
-    name = f"{fitted.name}-round{number}"
+    name = f"whole-round{number}"
     views: list[View] = [
         PseudoView(
             f"{name}-{index}.png",
@@ -257,9 +224,14 @@ def refit(
         )
         for index, candidate in enumerate((*selected, *added_before))
     ]
-    seed = seed_of_round(context.settings.seed, number) if stage == "refit" else None
     result = _fit(
-        context, name, stage, [*fitted.photos, *views], fitted.share, fitted.steps, seed=seed
+        context,
+        name,
+        "refit",
+        [*fitted.photos, *views],
+        seed=seed_of_round(context.settings.seed, number),
+        exposure="off",
+        transients="off",
     )
     return replace(
         fitted,
@@ -279,7 +251,7 @@ def score_test_views(context: Context, splats: Splats) -> MeanScores | None:
 
 
 def seed_of_round(seed: int, number: int) -> int:
-    """The seed of the whole fit of round ``number``, from 1."""
+    """The seed of the fit of round ``number``, from 1."""
     return int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
 
 
@@ -287,44 +259,23 @@ def _with_backdrop(context: Context, splats: Splats, photos: Sequence[View]) -> 
     return with_backdrop(splats, photos, context.backend) if context.has_backdrop else splats
 
 
-def _fit(
-    context: Context,
-    name: str,
-    stage: Stage,
-    views: list[View],
-    share: float = 1.0,
-    steps: float = 1.0,
-    *,
-    exposure: str = "off",
-    transients: str = "off",
-    seed: int | None = None,
-) -> FitResult:
-    settings = context.fit_settings
+def _fit(context: Context, name: str, stage: Stage, views: list[View], **given: Any) -> FitResult:
+    """Fit views; ``name`` is that of the checkpoint, ``given`` are settings of ``fit_capture``."""
     checkpoint = None if context.checkpoints is None else context.checkpoints / f"{name}.npz"
 
     def report(event: Event) -> None:
-        work = share * steps * event.done / event.total
-        context.progress.report(stage, work, event.message)
+        context.progress.report(stage, event.done / event.total, event.message)
 
-    whole = context.capture
-    sizes = {view.name: view.camera for view in whole.views}
-    # Folds have halved photos.
-    points = resized_tracks(whole.points, sizes, {view.name: view.camera for view in views})
     result = fit_capture(
-        Capture(whole.path, views, points),
+        Capture(context.capture.path, views, context.capture.points),
         report=report,
         backend=context.backend,
         checkpoint=checkpoint,
         resume=context.resume and checkpoint is not None and checkpoint.is_file(),
         backdrop=False,
-        **{
-            **settings,
-            "steps": max(1, round(steps * settings["steps"])),
-            "max_splats": max(1, round(share * context.max_splats)),
-            "seed": context.settings.seed if seed is None else seed,
-            "exposure": exposure,
-            "transients": transients,
-        },
+        quality=context.settings.quality,
+        steps=context.settings.steps,
+        **given,
     )
-    context.progress.add_work(share * steps)
+    context.progress.add_work(1.0)
     return result

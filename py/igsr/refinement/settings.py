@@ -11,9 +11,9 @@ from igsr.errors import IgsrError
 from igsr.fitting.presets import Quality
 from igsr.fitting.settings import MAX_STEPS, ExposureMode, TransientMode
 
-#: As many rounds as help, at most ``MAX_ROUNDS``.
+#: ``AUTO_ROUNDS`` by quality, or none if there are enough photos.
 AUTO = "auto"
-MAX_ROUNDS = 4
+AUTO_ROUNDS: dict[Quality, int] = {"draft": 1, "normal": 2, "high": 4}
 
 
 def _read_rounds(name: str, value: Any) -> int | str:
@@ -47,7 +47,6 @@ class RefineSettings:
     seed: int = field(default=0, metadata=about(limits=(0, 2**63 - 1)))
     exposure: ExposureMode = field(default="off", metadata=about())
     transients: TransientMode = field(default="auto", metadata=about())
-    cross_validate: bool = field(default=True, metadata=about())
 
     def __post_init__(self) -> None:
         validate(self)
@@ -55,4 +54,4 @@ class RefineSettings:
     @property
     def most_rounds(self) -> int:
         """Maximum number of rounds."""
-        return MAX_ROUNDS if isinstance(self.rounds, str) else self.rounds
+        return AUTO_ROUNDS[self.quality] if isinstance(self.rounds, str) else self.rounds

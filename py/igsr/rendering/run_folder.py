@@ -96,7 +96,7 @@ def run_scores(folder: Path) -> dict[str, Any]:
     report = _read(folder / REPORT)
     if isinstance(report.get("rounds"), list):
         rows = [_round_row(number, row) for number, row in enumerate(_rounds(report))]
-        return {"head": ["PSNR, dB", "test", "cross-validation", "splats"], "rows": rows}
+        return {"head": ["", "PSNR, dB", "splats"], "rows": rows}
     if run_progress(folder) is not None or "psnr" not in report:
         return {"head": [], "rows": []}  # while a fit runs, the report is an earlier run's
     metrics = ("psnr", "ssim", "flip")
@@ -129,17 +129,9 @@ def _label(number: int) -> str:
 
 
 def _round_row(number: int, row: dict[str, Any]) -> list[str]:
-    label = _label(number)
-    if number > 0:
-        label += ": accepted" if row.get("accepted") is True else ": not accepted"
-    validation = _member(row, "cross_validation")
-    before, after = (
-        _texts(_member(validation, when), ("psnr",))[0] for when in ("before", "after")
-    )
-    validated = MISSING if MISSING in (before, after) else f"{before} → {after}"
     splats = row.get("splats")
     count = str(splats) if isinstance(splats, int) else MISSING
-    return [label, *_texts(_member(row, "test"), ("psnr",)), validated, count]
+    return [_label(number), *_texts(_member(row, "test"), ("psnr",)), count]
 
 
 def _rounds(report: dict[str, Any]) -> list[dict[str, Any]]:

@@ -20,7 +20,6 @@ import igsr
 REPORT_KEYS: dict[str, str] = {
     "after": "with",
     "center": "center",
-    "cross_validation": "left_out",
     "gain": "worth",
     "mean_confidence": "mean_trust",
     "rejected": "passed",

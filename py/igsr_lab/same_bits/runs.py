@@ -253,7 +253,7 @@ def resumed(inputs: Inputs) -> Results:
 
 
 def refinements(inputs: Inputs) -> Results:
-    """Refinements: two rounds that are accepted, one that is not, and one that is resumed."""
+    """Refinements: two rounds, one whose novel views are all rejected, and one that is resumed."""
     options: dict[str, Any] = {"steps": 600, "backend": "cpu", "seed": 0}
     cleaner = Truthful(inputs.ball)
     colors = np.full((len(inputs.ball), 3), 128, np.uint8)
@@ -268,14 +268,14 @@ def refinements(inputs: Inputs) -> Results:
     igsr.refine(capture, 1, denoiser=cleaner, out=out, **options)
     refined = igsr.refine(capture, 2, denoiser=cleaner, out=out, resume=True, **options)
     yield "resumed.splats", [refined.first, refined.splats, len(refined.rounds)]
-    out = inputs.folder / "not accepted"
+    out = inputs.folder / "rejected"
     refined = igsr.refine(capture, "auto", denoiser=inverted, out=out, **options)
-    yield "not accepted.splats", [refined.first, refined.splats, len(refined.rounds)]
-    yield from prefixed("not accepted", refinement_files(out))
+    yield "rejected.splats", [refined.first, refined.splats, len(refined.rounds)]
+    yield from prefixed("rejected", refinement_files(out))
 
 
 class Truthful:
-    """A denoiser that knows the scene: its rounds are accepted."""
+    """A denoiser that knows the scene."""
 
     def __init__(self, splats: igsr.Splats) -> None:
         """Keep the scene."""
@@ -288,7 +288,7 @@ class Truthful:
 
 
 def inverted(render: Any, photos: Sequence[Any]) -> tuple[np.ndarray, np.ndarray]:
-    """A denoiser that makes all worse and is sure of it: its round is not accepted."""
+    """A denoiser that makes all worse and is sure of it: its views are rejected."""
     color = np.clip(render.color, 0.0, 1.0)
     return 1.0 - color, np.ones(color.shape[:2], np.float32)
 
@@ -499,7 +499,6 @@ def plain_photos(inputs: Inputs) -> Results:
         1,
         out=out / "refine",
         steps=100,
-        cross_validate=False,
         max_size=160,
         exposure="on",
         backend="cpu",

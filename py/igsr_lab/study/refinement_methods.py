@@ -38,7 +38,6 @@ class Method:
     method: str  # one of ``METHODS``
     views: int  # maximum number of views added per round
     rounds: int  # maximum number of rounds
-    cross_validate: bool  # whether igsr's rounds are cross-validated; the paper's never are
 
 
 def refine_keywords(
@@ -58,13 +57,11 @@ def refine_keywords(
             "denoiser": partial(_full_confidence, denoiser),
             "propose": partial(_given_views, given),
             "select": partial(select_by_true_picture, given, photos, method, distance),
-            "cross_validate": False,
         }
     ours = {
         "denoiser": denoiser,
         "propose": novel_views,
         "select": lambda candidates, count: select_views(candidates, method.views),
-        "cross_validate": method.cross_validate,
     }
     changes: dict[str, dict[str, Any]] = {
         "ours": {},

@@ -18,7 +18,7 @@ from igsr_lab.study.study import SCORE_COLUMNS, Row, deviation, difference_cell,
 #: Scores of the tables.
 SCORES = ("psnr", "ssim", "flip", "perceptual")
 GAINS_TEXT = (
-    "Gain of the last accepted round over round 0, with its standard error over held-out views; "
+    "Gain of the last round over round 0, with its standard error over held-out views; "
     "in brackets the standard deviation over seeds:"
 )
 PAPER_TEXT = "The paper's own figures (PSNR / SSIM / LPIPS, 5 000 iterations, DUSt3R poses):"
@@ -27,8 +27,8 @@ PAPER_TEXT = "The paper's own figures (PSNR / SSIM / LPIPS, 5 000 iterations, DU
 def summarized(rows: Sequence[Row]) -> Row:
     """Mean scores after each round, by method; a run that stopped keeps its last scores.
 
-    "near" and "far" are the PSNR of held-out views near a photo and far from all, "accepted" the
-    fraction of runs that accepted the round, "spread" the standard deviation of "psnr".
+    "near" and "far" are the PSNR of held-out views near a photo and far from all, "done" the
+    fraction of runs that did the round, "spread" the standard deviation of "psnr".
     """
     summary: Row = {}
     for method in rows[0]["methods"]:
@@ -44,9 +44,7 @@ def summarized(rows: Sequence[Row]) -> Row:
             for name in ("near", "far"):
                 known = [row[name]["psnr"] for row in done if row[name]]
                 means[name] = float(np.mean(known)) if known else None
-            means["accepted"] = float(
-                np.mean([len(run) > number and run[number]["accepted"] for run in runs])
-            )
+            means["done"] = float(np.mean([len(run) > number for run in runs]))
             means["spread"] = float(np.std([row["psnr"] for row in done]))
             rounds.append(means)
         summary[method] = {"runs": len(runs), "rounds": rounds}
@@ -106,14 +104,14 @@ def table_lines(report: Row) -> list[str]:
         [
             *group,
             number,
-            "" if number == 0 else f"{100.0 * row['accepted']:.0f} %",
+            "" if number == 0 else f"{100.0 * row['done']:.0f} %",
             *(format(row[name], SCORE_COLUMNS[name][1]) for name in names),
             *(cell(row[name], ".2f") for name in ("near", "far")),
         ]
         for *group, rounds in groups
         for number, row in enumerate(rounds)
     ]
-    heads = ["scene", "photos", "method", "round", "accepted"]
+    heads = ["scene", "photos", "method", "round", "done"]
     heads += [*(SCORE_COLUMNS[name][0] for name in names), "near, dB", "far, dB"]
     lines = [*markdown_table(heads, rows, left=3), "", GAINS_TEXT, "", *_gain_lines(report)]
     if report["paper"]:

@@ -26,7 +26,6 @@ from igsr.denoiser.weights import SHIPPED
 from igsr.errors import IgsrError
 from igsr.evaluation.scores import default_background, over_background, score_views
 from igsr.fitting.fingerprint import fingerprint
-from igsr.refinement.cross_validation import FOLDS
 from igsr.refinement.refine_photos import refine, round_denoiser
 from igsr.refinement.results import Refined
 from igsr.splats import Splats
@@ -54,8 +53,8 @@ NEAR_DEG = 45.0
 FAR_DEG = 60.0
 #: Scores of a round.
 SCORES = ("psnr", "ssim", "flip")
-#: Checkpoints of the fits that all methods of a run share.
-SHARED_FITS = ("whole", *(f"fold{number}" for number in range(FOLDS)))
+#: Checkpoint of the fit that all methods of a run share.
+SHARED_FIT = "whole.npz"
 
 
 @dataclass(frozen=True)
@@ -137,7 +136,7 @@ def run_refinement(settings: RefinementSettings, data: str, run: RefinementRun) 
     for number, method in enumerate(settings.methods):
         out = folder / method.name
         for earlier in settings.methods[:number]:
-            _share_fits(folder / earlier.name, out)
+            _share_fit(folder / earlier.name, out)
         refined = refine(
             photos,
             method.rounds,
@@ -159,22 +158,11 @@ def run_refinement(settings: RefinementSettings, data: str, run: RefinementRun) 
 
 
 def _round_rows(refined: Refined, first: Row, scorer: _Scorer, out: Path) -> list[Row]:
-    """Scores after each round; a rejected round repeats the scores before it."""
-    rows: list[Row] = [{**first, "splats": len(refined.first), "accepted": True}]
+    """Scores after each round."""
+    rows: list[Row] = [{**first, "splats": len(refined.first)}]
     for number, done in enumerate(refined.rounds, 1):
-        row = rows[-1]
-        if done.splats is not None:
-            row = scorer.scores(done.splats, out / f"round{number}.png")
-            row["splats"] = len(done.splats)
-        validation = {"before": done.validation_before, "after": done.validation_after}
-        rows.append(
-            {
-                **row,
-                "accepted": done.accepted,
-                "added": len(done.selected),
-                "cross_validation": validation,
-            }
-        )
+        scores = scorer.scores(done.splats, out / f"round{number}.png")
+        rows.append({**scores, "splats": len(done.splats), "added": len(done.selected)})
     return rows
 
 
@@ -254,11 +242,10 @@ def _remove_outdated(folder: Path, settings: RefinementSettings, photos: Capture
         write_json(note, made_with)
 
 
-def _share_fits(source: Path, out: Path) -> None:
-    """Copy checkpoints of the fits that all methods begin with, so that each is done once."""
-    (out / "checkpoints").mkdir(parents=True, exist_ok=True)
-    for name in SHARED_FITS:
-        done, own = (folder / "checkpoints" / f"{name}.npz" for folder in (source, out))
-        if done.is_file() and not own.is_file():
-            with atomic_write(own) as temporary:
-                shutil.copyfile(done, temporary)
+def _share_fit(source: Path, out: Path) -> None:
+    """Copy the checkpoint of the fit that all methods begin with, so that it is done once."""
+    done, own = (folder / "checkpoints" / SHARED_FIT for folder in (source, out))
+    own.parent.mkdir(parents=True, exist_ok=True)
+    if done.is_file() and not own.is_file():
+        with atomic_write(own) as temporary:
+            shutil.copyfile(done, temporary)

@@ -6,7 +6,7 @@ Each takes the ``options`` of ``RefinementSettings``: ``weights``, ``features``,
 * "scenes": by scene and choice of photos, such as "localized 10", and by method: "rounds" with
   mean scores, 0 the fit to the photos alone;
 * the same over all scenes by layout;
-* "gains" and "mean_gains": paired gains of the last accepted round over round 0;
+* "gains" and "mean_gains": paired gains of the last round over round 0;
 * "runs", "protocol" and "paper", the paper's own figures.
 """
 
@@ -85,7 +85,7 @@ def table2(
     """
     kinds = [(scene, layout, 10) for scene in scenes for layout in ("localized", "scattered")]
     chosen = [
-        Method(name, name, MAX_SELECTED if name in OURS else 2, 2 if name in OURS else 1, True)
+        Method(name, name, MAX_SELECTED if name in OURS else 2, 2 if name in OURS else 1)
         for name in methods
     ]
     title = "Table 2: 10 photos, one round of the paper's methods and two of igsr's"
@@ -101,7 +101,7 @@ def table3(
 ) -> Row:
     """Refine a real object from 4 localized photos by two rounds: the paper's Table 3."""
     kinds = [(scene, "localized", 4) for scene in scenes]
-    chosen = [Method(name, name, MAX_SELECTED if name in OURS else 1, 2, True) for name in methods]
+    chosen = [Method(name, name, MAX_SELECTED if name in OURS else 1, 2) for name in methods]
     title = "Table 3: two rounds, 4 localized photos"
     return _refined(study, title, kinds, chosen, options, TABLE3_PAPER)
 
@@ -113,11 +113,11 @@ def sweep(
     views: tuple[str, ...] = ("4", "6", "10", "15"),
     **options: Any,
 ) -> Row:
-    """Refine by four rounds of 1, 2 and 4 views without cross-validation, from scattered photos."""
+    """Refine by four rounds of 1, 2 and 4 views, from scattered photos."""
     if not views or not all(_is_number(text) for text in views):
         raise IgsrError(f"views must be numbers of photos, not {', '.join(views) or 'none'}.")
     kinds = [(scene, "scattered", int(text)) for scene in scenes for text in views]
-    chosen = [Method(f"ours-{count}", "ours", count, SWEPT_ROUNDS, False) for count in SWEPT_VIEWS]
+    chosen = [Method(f"ours-{count}", "ours", count, SWEPT_ROUNDS) for count in SWEPT_VIEWS]
     return _refined(study, "Photos, rounds and views added per round", kinds, chosen, options)
 
 
@@ -129,7 +129,7 @@ def photographs(
     max_size: int | None = None,
     **options: Any,
 ) -> Row:
-    """Refine real captures by two cross-validated rounds, as ``igsr.refine``.
+    """Refine real captures by two rounds, as ``igsr.refine``.
 
     Every 8th photo is held out; the fitted photos are evenly spaced among the rest.
 
@@ -145,8 +145,8 @@ def photographs(
     kinds = [
         (scene, "even", count) for scene in scenes for count in _counts(views, study.data / scene)
     ]
-    title = "Photographs: two cross-validated rounds"
-    chosen = [Method("ours", "ours", MAX_SELECTED, 2, True)]
+    title = "Photographs: two rounds"
+    chosen = [Method("ours", "ours", MAX_SELECTED, 2)]
     return _refined(study, title, kinds, chosen, {**options, "max_size": max_size})
 
 
@@ -157,9 +157,9 @@ def refinement_ablation(
     methods: tuple[str, ...] = (*OURS, "improvement"),
     **options: Any,
 ) -> Row:
-    """Refine by one round without cross-validation, with one part left out at a time."""
+    """Refine by one round, with one part left out at a time."""
     kinds = [(scene, "even", ABLATION_PHOTOS.get(scene, 10)) for scene in scenes]
-    chosen = [Method(name, name, MAX_SELECTED if name in OURS else 2, 1, False) for name in methods]
+    chosen = [Method(name, name, MAX_SELECTED if name in OURS else 2, 1) for name in methods]
     return _refined(study, "One round, without parts of the refinement", kinds, chosen, options)
 
 
