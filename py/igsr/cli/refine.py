@@ -42,7 +42,8 @@ def refine_command(
     out: Annotated[Path, option("--out", help="Folder for the scene and its report.")],
     example: ExampleOption = False,
     rounds: Annotated[
-        str, option("--rounds", metavar="auto|N", help="Maximum number of rounds; auto: 1, 2 or 4 by quality.")
+        str,
+        option("--rounds", metavar="auto|N", help="Number of rounds; auto: 1, 2 or 4 by quality."),
     ] = "auto",
     quality: QualityOption = "normal",
     max_size: FitSizeOption = None,
