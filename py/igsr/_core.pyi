@@ -317,6 +317,17 @@ class Fitter:
     def step(self, count: int) -> dict[str, Any]:
         """Do ``count`` steps. Returns ``step``, ``splats`` (their number) and the last ``loss``."""
 
+    def measured_steps(self, count: int) -> list[list[tuple[str, float]]]:
+        """Do ``count`` steps; return the commands of each with their milliseconds on the GPU.
+
+        Commands are entry points of kernels, "copy" and "clear". Each runs in a pass of its own, so
+        steps take longer than by ``step``.
+
+        Raises:
+            ValueError: the backend is "cpu".
+            RuntimeError: the device has no timestamps.
+        """
+
     @property
     def steps_done(self) -> int:
         """Number of steps done, with those before the fit was resumed."""

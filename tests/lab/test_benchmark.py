@@ -19,7 +19,17 @@ from PIL import Image
 from igsr import _core
 from igsr._internal import peak_memory
 from igsr.errors import IgsrError
-from igsr_lab.bench import accuracy, fit_rows, growth, oracle, run, scenes, stage_rows, two_builds
+from igsr_lab.bench import (
+    accuracy,
+    fit_rows,
+    growth,
+    kernel_times,
+    oracle,
+    run,
+    scenes,
+    stage_rows,
+    two_builds,
+)
 from igsr_lab.bench.comparison import MIN_FLIP, gradient_error, picture_error, size_row
 from igsr_lab.bench.plots import plot_speed_vs_error
 from igsr_lab.bench.table import describe_machine, not_run_lines
@@ -412,6 +422,23 @@ def test_bench_writes_machine_and_rows(lab_here, tmp_path):
     assert Image.open(tmp_path / "plot.png").width > 500
 
 
+def test_a_profile_has_the_kernels_of_a_fit_step(lab_here, tmp_path, monkeypatch):
+    for name in ("SIZES", "SMALL_SIZES"):
+        monkeypatch.setattr(kernel_times, name, ((200, 32),))
+    done = lab_here("bench", "--profile", "--json", tmp_path / "kernels.json")
+    assert done.returncode == 0, done.stderr
+    assert "200 splats, 32x32: " in done.stdout
+    (table,) = json.loads((tmp_path / "kernels.json").read_text())["kernels"]
+    calls = {row["name"]: row["calls"] for row in table["kernels"]}
+    assert calls["rasterize_backward"] == calls["fit_geometry"] == calls["copy"] == 1
+    assert sum(count for name, count in calls.items() if name.startswith("sort_")) >= 12
+    assert all(row["median"] >= row["least"] >= 0.0 for row in table["kernels"])
+    assert all(name in done.stdout for name in calls)
+    medians = [row["median"] for row in table["kernels"]]
+    assert medians == sorted(medians, reverse=True)
+    assert table["device_ms"] == pytest.approx(sum(medians), rel=0.5)
+
+
 W3 = ["--workload", "W3"]
 PAGE = ["--accuracy", "page.md"]
 BUILD = ["--compare", "a.so"]
@@ -430,6 +457,7 @@ BUILD = ["--compare", "a.so"]
         ([*PAGE, "--garden", "a.npz"], "leave --garden out"),
         ([*PAGE, "--capture", "a"], "leave --capture out"),
         ([*PAGE, "--models", "a"], "leave --models out"),
+        (["--profile", "--garden", "a.npz"], "--profile runs no workloads; leave --garden out"),
         (["--fail-above", "10"], "--compare FILE"),
         ([*BUILD, "--fail-above", "-1"], "--fail-above"),
         ([*BUILD, *W3], "leave W2 and W3 out"),

@@ -11,7 +11,7 @@ import igsr
 from igsr import _core
 from igsr.errors import IgsrError
 from igsr_lab import bench as benchmark
-from igsr_lab.bench import gpu_report, gsplat_rows, run, viewer_rows
+from igsr_lab.bench import gpu_report, gsplat_rows, kernel_times, run, viewer_rows
 from igsr_lab.bench.growth import shot_of
 from igsr_lab.bench.scenes import upstream
 from igsr_lab.commands import gpu_check
@@ -23,6 +23,8 @@ def small(monkeypatch):
     monkeypatch.setattr(gpu_report, "GROWN_COUNT", 200)
     monkeypatch.setattr(gpu_report, "GROWN_SIDE", 32)
     monkeypatch.setattr(gpu_report, "SMALL_BALL", (200, 32))
+    monkeypatch.setattr(kernel_times, "SIZES", ((200, 32),))
+    monkeypatch.setattr(kernel_times, "SMALL_SIZES", ((200, 32),))
     monkeypatch.setattr(gpu_report, "SIZES", ((64, 48),))
     monkeypatch.setattr(viewer_rows, "SPLATS", 300)
     monkeypatch.setattr(viewer_rows, "SMALL_SPLATS", 300)
@@ -54,6 +56,9 @@ def test_the_page_has_the_device_times_errors_and_failed_tests(small, tmp_path):
         if row["ms"] is not None and row["workload"] != "viewer":
             assert row["max_error"] < 1e-3
             assert f"{row['max_error']:.1e}" in page
+    (table,) = figures["kernels"]
+    assert table["ms"] > 0.0
+    assert "<td>rasterize_backward</td>" in page
     (frame,) = (row for row in figures["rows"] if row["workload"] == "viewer")
     assert frame["ms_median"] >= frame["ms"] > 0.0
     assert (frame["splats"], frame["width"], frame["height"]) == (300, 64, 48)

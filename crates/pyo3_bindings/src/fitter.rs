@@ -5,6 +5,7 @@ use std::sync::{Mutex, MutexGuard};
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
+use splat_render::fit::CommandTime;
 
 use crate::arguments::{Call, setting};
 use crate::arrays::{array, rows, shaped, shaped_rows};
@@ -117,6 +118,17 @@ impl Fitter {
         done.set_item("loss", loss)?;
         done.set_item("splats", splats)?;
         Ok(done)
+    }
+
+    /// Does `count` steps; returns the names and milliseconds of the commands of each, on a GPU.
+    fn measured_steps(
+        &self,
+        py: Python<'_>,
+        count: u32,
+    ) -> PyResult<Vec<Vec<(&'static str, f64)>>> {
+        let steps = py.detach(|| self.lock()?.measured_steps(count).map_err(to_python))?;
+        let named = |step: Vec<CommandTime>| step.iter().map(|time| (time.name, time.ms)).collect();
+        Ok(steps.into_iter().map(named).collect())
     }
 
     /// Steps done.

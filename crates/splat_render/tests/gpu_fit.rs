@@ -348,6 +348,29 @@ fn running_out_of_room_for_pairs_changes_nothing() {
 }
 
 #[test]
+fn measured_steps_have_the_same_bits_and_a_time_for_each_command() {
+    let capture = capture(2, &[(40, 33)], 120);
+    let (expected, _) = run(&mut gpu_fit(), &capture, 4, 0.0);
+    let mut device = gpu_fit();
+    device.measure_commands(true).unwrap();
+    let (measured, _) = run(&mut device, &capture, 4, 0.0);
+    assert!(measured == expected, "measuring changed bits");
+    let times = device.command_times();
+    assert!(times.len() >= 4, "{}", times.len());
+    for step in &times {
+        let names: Vec<_> = step.iter().map(|time| time.name).collect();
+        for name in ["copy", "project", "rasterize_backward", "fit_geometry"] {
+            assert!(names.contains(&name), "{name} is not in {names:?}");
+        }
+        assert!(step.iter().all(|time| time.ms >= 0.0));
+        assert!(step.iter().map(|time| time.ms).sum::<f64>() > 0.0);
+    }
+    assert!(device.command_times().is_empty());
+    let error = CpuFit::default().measure_commands(true).unwrap_err().to_string();
+    assert!(error.contains("choose gpu"), "{error}");
+}
+
+#[test]
 fn missing_splats_are_named() {
     let capture = capture(4, &[(20, 20)], 5);
     let mut device = gpu_fit();

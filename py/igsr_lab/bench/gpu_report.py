@@ -14,14 +14,13 @@ from igsr.errors import IgsrError
 from igsr.evaluation.report_page import write_template
 from igsr_lab.bench.growth import GROWN_COUNT, GROWN_SIDE, shot_of
 from igsr_lab.bench.gsplat_rows import NAME, gsplat_rows, why_not
+from igsr_lab.bench.kernel_times import SOFTWARE, kernel_tables
 from igsr_lab.bench.run import Settings, not_run, rows_or_reason, run_benchmark
 from igsr_lab.bench.scenes import garden, upstream
 from igsr_lab.bench.stage_rows import pipeline_rows
 from igsr_lab.bench.table import milliseconds, not_run_lines
 from igsr_lab.bench.viewer_rows import SIZES, VIEWER, viewer_rows
 
-#: wgpu's kind of software adapters.
-SOFTWARE = "Cpu"
 #: Splats and side of the ball for software adapters.
 SMALL_BALL = (10_000, 256)
 #: The scene that gsplat renders, too, if no garden is given: W4's, forward and backward.
@@ -63,7 +62,10 @@ def device_report(
             on_row(f"{name} on {backend}")
             work = partial(pipeline_rows, name, scene, backend, settings.seed, settings.seconds)
             report["rows"] += rows_or_reason(name, backend, work)
+    kernels: list[dict[str, Any]] = []
     if "gpu" in settings.backends:
+        on_row("the kernels of a fit step")
+        kernels = kernels_or_none(settings.seed)
         for size in SIZES:
             on_row(f"the viewer at {size[0]} x {size[1]}")
             work = partial(viewer_rows, size, settings.seed, small)
@@ -76,7 +78,15 @@ def device_report(
         v_image = upstream(settings.seed, scene.width, scene.height)
         work = partial(gsplat_rows, name, scene, v_image, settings.seconds)
         report["rows"] += rows_or_reason(name, NAME, work)
-    return {"device": device, **report}
+    return {"device": device, "kernels": kernels, **report}
+
+
+def kernels_or_none(seed: int) -> list[dict[str, Any]]:
+    """Times of kernels; [] if the device has no timestamps or fails, as other rows show."""
+    try:
+        return kernel_tables(seed)
+    except RuntimeError:
+        return []
 
 
 def json_beside(path: Path) -> Path:
@@ -93,6 +103,7 @@ def write_device_report(path: Path, report: dict[str, Any]) -> None:
         "machine": report["machine"],
         "device": report["device"],
         "tests": report.get("tests"),
+        "kernels": report.get("kernels", []),
         "rows": [_cells(row) for row in report["rows"] if row["ms"] is not None],
         "not_run": not_run_lines(report["rows"]),
         "json": json_beside(path).name,

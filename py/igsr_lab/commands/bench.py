@@ -113,6 +113,10 @@ def bench_command(
     report_path: ReportOption = None,
     compare: CompareOption = None,
     fail_above: FailAboveOption = None,
+    profile: Annotated[
+        bool,
+        option("--profile", help="Instead of workloads, measure a fit step's kernels on the GPU."),
+    ] = False,
 ) -> None:
     """Measure speed, and error against the float64 reference, of the backends.
 
@@ -137,6 +141,11 @@ def bench_command(
             "--models": models,
             "--report": report_path,
         }
+        if profile:
+            _refuse(
+                {**given, "--compare": compare, "--accuracy": accuracy, "--plot": plot},
+                "--profile runs no workloads",
+            )
         if compare is not None:
             only = "--compare runs W1 and W4 only"
             _refuse({**given, "--accuracy": accuracy, "--plot": plot}, only)
@@ -149,6 +158,12 @@ def bench_command(
             if path is not None:
                 check_writable(path)
         console = error_console()
+        if profile:
+            tables = benchmark.kernel_tables(seed)
+            if json_path is not None:
+                write_json(json_path, {"kernels": tables})
+            benchmark.print_kernels(output_console(), tables)
+            return
         chosen = tuple(one.value for one in workloads or WorkloadChoice)
         settings = benchmark.Settings(
             backends=names,

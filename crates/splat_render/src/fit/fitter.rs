@@ -17,7 +17,7 @@ use super::exposures::{ExposureState, Exposures};
 use crate::camera::Camera;
 use crate::error::{Error, Result};
 use crate::extent::camera_extent;
-use crate::fit_device::{FitDevice, FitState, McmcRun, OriginalRun, StepInput};
+use crate::fit_device::{CommandTime, FitDevice, FitState, McmcRun, OriginalRun, StepInput};
 use crate::stages::Exposure;
 use crate::target::Target;
 
@@ -220,6 +220,16 @@ impl Fitter {
     /// Loss of the last step.
     pub fn loss(&mut self) -> Result<f32> {
         self.device.loss()
+    }
+
+    /// Does `count` steps and measures their commands, in order, on the device. Steps that are repeated
+    /// for lack of room are measured again.
+    pub fn measured_steps(&mut self, count: u32) -> Result<Vec<Vec<CommandTime>>> {
+        self.device.measure_commands(true)?;
+        let done = (0..count).try_for_each(|_| self.step());
+        let times = self.device.command_times();
+        self.device.measure_commands(false)?;
+        done.map(|()| times)
     }
 
     /// Everything needed to go on bit for bit, with [`Fitter::steps_done`].

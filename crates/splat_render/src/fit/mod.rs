@@ -18,8 +18,8 @@ pub use initial::splats_from_points;
 
 pub use crate::constants::{ADAM, SSIM_C, SSIM_WINDOW};
 pub use crate::fit_device::{
-    COLOR_WAIT, CameraGradient, DensityStats, ExposureGradient, FitDevice, FitState, McmcRun,
-    OriginalRun, StepInput, is_dropped, noise_normal,
+    COLOR_WAIT, CameraGradient, CommandTime, DensityStats, ExposureGradient, FitDevice, FitState,
+    McmcRun, OriginalRun, StepInput, is_dropped, noise_normal,
 };
 pub use crate::splats::SplatArrays;
 pub use crate::stages::{Exposure, Rates};

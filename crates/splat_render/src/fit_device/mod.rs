@@ -230,6 +230,25 @@ pub trait FitDevice: Send {
 
     /// Loss of the last step (before its update, regularizers not included).
     fn loss(&mut self) -> Result<f32>;
+
+    /// Begins or ends to measure the commands of each step, which makes steps slower.
+    fn measure_commands(&mut self, _on: bool) -> Result<()> {
+        Err(Error::argument("backend", "measures kernels on GPUs only; choose gpu"))
+    }
+
+    /// Times of the commands of each step since the last call, in order.
+    fn command_times(&mut self) -> Vec<Vec<CommandTime>> {
+        Vec::new()
+    }
+}
+
+/// Time of a command of a step on a GPU.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CommandTime {
+    /// The entry point of the kernel, "clear" or "copy".
+    pub name: &'static str,
+    /// Milliseconds.
+    pub ms: f64,
 }
 
 /// Lets a density control work on the host, on the splats that move; returns their number.

@@ -56,6 +56,17 @@ pub(in crate::gpu) enum Op {
     Copy(wgpu::Buffer, wgpu::Buffer, u64, u64),
 }
 
+impl Op {
+    /// The entry point of the kernel, "clear" or "copy".
+    pub fn name(&self) -> &'static str {
+        match self {
+            Self::Dispatch { kernel, .. } => kernel.entry(),
+            Self::Clear(_) => "clear",
+            Self::Copy(..) => "copy",
+        }
+    }
+}
+
 impl Gpu {
     fn pipeline(&self, kernel: Kernel) -> &Pipeline {
         self.pipelines[kernel as usize].get_or_init(|| {

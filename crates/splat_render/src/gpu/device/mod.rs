@@ -1,11 +1,12 @@
-//! The device and its errors. `adapter.rs` opens it, `buffers.rs` makes buffers, and `commands.rs` runs
-//! kernels.
+//! The device and its errors. `adapter.rs` opens it, `buffers.rs` makes buffers, `commands.rs` runs
+//! kernels, and `times.rs` measures them.
 
 mod adapter;
 mod buffers;
 mod commands;
 mod injected;
 mod limits;
+mod times;
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};

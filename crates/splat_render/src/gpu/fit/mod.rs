@@ -35,8 +35,8 @@ use super::original::reset_op;
 use super::project_backward::camera_sum;
 use crate::error::{Error, Result};
 use crate::fit_device::{
-    CameraGradient, ColorStep, ExposureGradient, FitDevice, FitState, McmcRun, OriginalRun,
-    StepInput, WaitingSteps, control_on_host, dropout_threshold, mcmc, original,
+    CameraGradient, ColorStep, CommandTime, ExposureGradient, FitDevice, FitState, McmcRun,
+    OriginalRun, StepInput, WaitingSteps, control_on_host, dropout_threshold, mcmc, original,
 };
 use crate::sh;
 use crate::stages::ProjectOptions;
@@ -76,6 +76,8 @@ pub struct GpuFit {
     pending_exposures: Option<wgpu::Buffer>,
     /// The last step: its photo, SSIM weight, and whether it compared depths.
     last: Option<(usize, f32, bool)>,
+    /// Times of the commands of each step, while they are measured.
+    times: Option<Vec<Vec<CommandTime>>>,
 }
 
 #[derive(Debug)]
@@ -116,6 +118,7 @@ impl GpuFit {
             exposure_gradients: Vec::new(),
             pending_exposures: None,
             last: None,
+            times: None,
         }
     }
 
@@ -236,7 +239,12 @@ impl GpuFit {
             self.set_overflow(0)?;
         }
         let frame = &self.frames[self.photos[input.view].frame];
-        self.gpu.submit(&[&copies, &frame.ops, &sums])
+        let lists: [&[Op]; 3] = [&copies, &frame.ops, &sums];
+        match &mut self.times {
+            Some(times) => times.push(self.gpu.submit_timed(&lists)?),
+            None => self.gpu.submit(&lists)?,
+        }
+        Ok(())
     }
 
     /// Takes in the sums of these steps, which have been done, for cameras and exposures.
@@ -541,5 +549,15 @@ impl FitDevice for GpuFit {
         let [ssim, l1] = LossBuffers::total(&data[0]);
         let depth = data.get(1).map_or(0.0, |bytes| DepthBuffers::total(bytes));
         Ok((photo.weight.loss(f64::from(ssim_weight), l1, ssim) + depth) as f32)
+    }
+
+    fn measure_commands(&mut self, on: bool) -> Result<()> {
+        self.settle()?;
+        self.times = on.then(Vec::new);
+        Ok(())
+    }
+
+    fn command_times(&mut self) -> Vec<Vec<CommandTime>> {
+        self.times.as_mut().map(std::mem::take).unwrap_or_default()
     }
 }

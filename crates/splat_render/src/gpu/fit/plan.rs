@@ -27,14 +27,8 @@ pub struct PlannedFit {
     ops: Vec<Op>,
 }
 
-/// Names of commands: the entry points of kernels, "clear" and "copy".
 fn names(ops: &[Op]) -> Vec<&'static str> {
-    let name = |op: &Op| match op {
-        Op::Dispatch { kernel, .. } => kernel.entry(),
-        Op::Clear(_) => "clear",
-        Op::Copy(..) => "copy",
-    };
-    ops.iter().map(name).collect()
+    ops.iter().map(Op::name).collect()
 }
 
 impl PlannedFit {
