@@ -15,7 +15,7 @@ from igsr.cli.lazy_group import LazyGroup
 
 
 def commands_markdown() -> str:
-    """A section for each command: what it does, how it is called, its arguments and options."""
+    """Return a section for each command, with its help, usage, arguments and options."""
     return "\n".join(line for name, command in walk() for line in _section(name, command))
 
 
@@ -64,7 +64,7 @@ def _place(argument: Any) -> str:
 
 
 def _value(option: Any) -> str:
-    """What stands behind an option: a name for the value, or the values there are."""
+    """Return the name of an option's value, or the possible values."""
     kind = _type(option)
     if option.is_flag or kind is bool:
         return ""
@@ -93,7 +93,7 @@ def _type(option: Any) -> Any:
 
 def _default(option: Any) -> str:
     default = getattr(option.default, "value", option.default)
-    # False and True are flags'; what is no plain value is a marker for "none given".
+    # Flags have False or True; other types mark "none given".
     return f"`{default}`" if type(default) in (int, float, str) else ""
 
 

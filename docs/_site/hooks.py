@@ -1,7 +1,7 @@
-"""What ``mkdocs build`` makes of three pages: the command line, CHANGELOG.md and CONTRIBUTING.md.
+"""Hooks of ``mkdocs build`` for three pages: the command line, CHANGELOG.md and CONTRIBUTING.md.
 
-The page of the command line is made from the commands themselves, so it cannot go stale. The other
-two stand in the repository's root, where people and forges look for them.
+The page of the command line is generated from the commands, so it is always current. The two files
+are in the repository's root, as forges expect.
 """
 
 from __future__ import annotations

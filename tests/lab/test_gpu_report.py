@@ -6,6 +6,7 @@ import time
 import types
 
 import pytest
+import torch
 
 import igsr
 from igsr import _core
@@ -150,16 +151,31 @@ def test_failed_tests_are_named():
 def test_gsplat_gets_the_scene_and_its_rows_have_errors(monkeypatch):
     gsplat = types.SimpleNamespace(__version__="0", rasterization=igsr.rasterization)
     monkeypatch.setitem(sys.modules, "gsplat", gsplat)
-    arguments = ("ball", shot_of(0, 30, 16).scene, upstream(0, 16, 16), 0.0, "cpu")
-    picture, gradients = gsplat_rows.gsplat_rows(*arguments)
-    for row, kind in ((picture, "forward"), (gradients, "backward")):
+    shot = shot_of(0, 30, 16)
+    arguments = ("ball", shot.scene, upstream(0, 16, 16), 0.0, "cpu")
+    picture, gradients, step = gsplat_rows.gsplat_rows(*arguments, photo=shot.photo)
+    kinds = ("forward", "backward", "fit step")
+    for row, kind in zip((picture, gradients, step), kinds, strict=True):
         assert (row["pass"], row["backend"]) == (kind, "gsplat")
         assert row["ms"] > 0.0
+    assert step["loss"] == "conv2d"
+    assert step["max_error"] == gradients["max_error"]
+    assert len(gsplat_rows.gsplat_rows(*arguments)) == 2, "without a photo, no step"
     assert picture["error_of"] == "picture"
     assert 0.0 < picture["max_error"] < 1e-5
     assert gradients["error_of"] == "gradients"
     assert 0.0 < gradients["max_error"] < 1e-4
     assert gradients["worst"].startswith("v_")
+
+    def fused_ssim(one, other):
+        assert one.shape == other.shape == (1, 3, 16, 16)
+        return torch.ones(())
+
+    monkeypatch.setitem(sys.modules, "fused_ssim", types.SimpleNamespace(fused_ssim=fused_ssim))
+    monkeypatch.setattr(gsplat_rows.importlib.util, "find_spec", lambda name: name)
+    name, loss = gsplat_rows.step_loss()
+    picture, photo = torch.full((16, 16, 3), 0.5), torch.zeros(16, 16, 3)
+    assert (name, float(loss(picture, photo))) == ("fused_ssim", pytest.approx(0.8 * 0.5))
 
     def fails(**given):
         raise TypeError("unexpected keyword")

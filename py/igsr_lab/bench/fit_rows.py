@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -65,8 +65,8 @@ KINK = 2e-6
 #: Charbonnier's smoothing of |x|, for colors in [0, 1].
 CHARBONNIER_EPSILON = 1e-3
 
-#: From a picture and a photo [H, W, 3] and the mask of the pixels that count [H, W].
-Loss = Callable[[Tensor, Tensor, Tensor], Tensor]
+#: From a picture and a photo [H, W, 3] and the mask of the pixels that count [H, W], None for all.
+Loss = Callable[[Tensor, Tensor, Tensor | None], Tensor]
 
 
 @dataclass(frozen=True)
@@ -136,10 +136,11 @@ def fitted_model(capture: Capture, count: int, models: Path, seed: int) -> Splat
     return splats
 
 
-def fit_loss(picture: Tensor, photo: Tensor, mask: Tensor) -> Tensor:
+def fit_loss(picture: Tensor, photo: Tensor, mask: Tensor | None) -> Tensor:
     """The fit's loss on [H, W, 3]: 0.8 L1 + 0.2 (1 - SSIM), zero-padded."""
     x, y = picture.permute(2, 0, 1)[:, None], photo.permute(2, 0, 1)[:, None]
-    at = torch.arange(SSIM_SIDE_PX, dtype=picture.dtype) - SSIM_SIDE_PX // 2
+    at = torch.arange(SSIM_SIDE_PX, dtype=picture.dtype, device=picture.device)
+    at = at - SSIM_SIDE_PX // 2
     line = torch.exp(-(at**2) / (2.0 * SSIM_SIGMA_PX**2))
     line = line / line.sum()
     window = (line[:, None] * line[None, :])[None, None]
@@ -153,7 +154,7 @@ def fit_loss(picture: Tensor, photo: Tensor, mask: Tensor) -> Tensor:
     ssim = ssim / ((mx * mx + my * my + SSIM_C1) * (xx + yy + SSIM_C2))
     l1 = (picture - photo).abs().mean(dim=2)
     per_pixel = (1.0 - SSIM_WEIGHT) * l1 + SSIM_WEIGHT * (1.0 - ssim[:, 0].mean(dim=0))
-    return per_pixel[mask].mean()
+    return per_pixel.mean() if mask is None else per_pixel[mask].mean()
 
 
 def charbonnier(picture: Tensor, photo: Tensor, mask: Tensor | None) -> Tensor:
@@ -277,6 +278,15 @@ def _fit_gradients(shot: Shot, backend: str, mask: npt.NDArray[np.bool_]) -> Arr
     }
 
 
+def adam(parameters: Mapping[str, Tensor], **options: Any) -> torch.optim.Adam:
+    """Torch's Adam at the fit's rates, with a tenth of the rate for means."""
+    rates = {"means": 1.6e-5, "quats": 1e-3, "scales": 5e-3, "opacities": 5e-2}
+    groups = [
+        {"params": [tensor], "lr": rates.get(name, 2.5e-3)} for name, tensor in parameters.items()
+    ]
+    return torch.optim.Adam(groups, eps=1e-15, **options)
+
+
 class CustomLoop:
     """A fit by ``igsr.rasterization``, torch's Adam and a Charbonnier loss.
 
@@ -292,14 +302,7 @@ class CustomLoop:
             name: torch.from_numpy(scene.splats[name].copy()).requires_grad_()
             for name in PARAMETERS
         }
-        rates = {"means": 1.6e-5, "quats": 1e-3, "scales": 5e-3, "opacities": 5e-2}
-        self.optimizer = torch.optim.Adam(
-            [
-                {"params": [tensor], "lr": rates.get(name, 2.5e-3)}
-                for name, tensor in self.parameters.items()
-            ],
-            eps=1e-15,
-        )
+        self.optimizer = adam(self.parameters)
         fx, fy, cx, cy = scene.intrinsics
         self.K = torch.tensor([[[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]])
         self.viewmat = torch.from_numpy(scene.viewmat)[None]

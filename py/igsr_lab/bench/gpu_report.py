@@ -12,8 +12,9 @@ from igsr import _core
 from igsr._internal.json_file import write_json
 from igsr.errors import IgsrError
 from igsr.evaluation.report_page import write_template
-from igsr_lab.bench.growth import GROWN_COUNT, GROWN_SIDE, shot_of
+from igsr_lab.bench.growth import GROWN_COUNT, GROWN_SIDE, evenly_chosen, shot_of
 from igsr_lab.bench.gsplat_rows import NAME, gsplat_rows, why_not
+from igsr_lab.bench.kernel_times import SIZES as SIZES_OF_STEPS
 from igsr_lab.bench.kernel_times import SOFTWARE, kernel_tables
 from igsr_lab.bench.run import Settings, not_run, rows_or_reason, run_benchmark
 from igsr_lab.bench.scenes import garden, upstream
@@ -52,11 +53,10 @@ def device_report(
     report = run_benchmark(replace(settings, small=small), on_row)
     count, side = SMALL_BALL if small else (GROWN_COUNT, GROWN_SIDE)
     name = BALL if settings.garden is None else "W2"
-    scene = (
-        shot_of(settings.seed, count, side).scene
-        if settings.garden is None
-        else garden(settings.garden, settings.seed)
-    )
+    ball = shot_of(settings.seed, count, side)
+    scene = ball.scene
+    if settings.garden is not None:
+        scene = garden(settings.garden, settings.seed)
     if name == BALL:
         for backend in settings.backends:
             on_row(f"{name} on {backend}")
@@ -76,9 +76,21 @@ def device_report(
         report["rows"].append(not_run(name, NAME, reason))
     else:
         v_image = upstream(settings.seed, scene.width, scene.height)
-        work = partial(gsplat_rows, name, scene, v_image, settings.seconds)
+        photo = ball.photo if name == BALL else None
+        work = partial(gsplat_rows, name, scene, v_image, settings.seconds, photo=photo)
         report["rows"] += rows_or_reason(name, NAME, work)
+        for count, side in SIZES_OF_STEPS:
+            work = partial(gsplat_steps, settings, count, side)
+            report["rows"] += rows_or_reason("W4", NAME, work, count)
     return {"device": device, "kernels": kernels, **report}
+
+
+def gsplat_steps(settings: Settings, count: int, side: int) -> list[dict[str, Any]]:
+    """gsplat's rows on a ball of W4."""
+    shot = shot_of(settings.seed, count, side)
+    v_image = upstream(settings.seed, side, side)
+    options: dict[str, Any] = {"photo": shot.photo, "chosen": evenly_chosen}
+    return gsplat_rows("W4", shot.scene, v_image, settings.seconds, **options)
 
 
 def kernels_or_none(seed: int) -> list[dict[str, Any]]:

@@ -5,14 +5,18 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
+from torch import Tensor
 
 from igsr import _core
 from igsr.errors import IgsrError
 from igsr_lab.bench.comparison import BOUND_3D, errors_row, size_row
+from igsr_lab.bench.fit_rows import SSIM_WEIGHT, Shot, adam, fit_loss
 from igsr_lab.bench.scenes import Arrays, Scene
 from igsr_lab.bench.stage_rows import compare_picture, repeated
 
@@ -28,10 +32,45 @@ def why_not() -> str | None:
     return None
 
 
+def step_loss() -> tuple[str, Callable[[Tensor, Tensor], Tensor]]:
+    """The fit's loss with a name: by the package fused_ssim if it is installed, else by conv2d."""
+    if importlib.util.find_spec("fused_ssim") is None:
+        return "conv2d", lambda picture, photo: fit_loss(picture, photo, None)
+    fused_ssim = importlib.import_module("fused_ssim").fused_ssim
+
+    def fused(picture: Tensor, photo: Tensor) -> Tensor:
+        planes = (image.permute(2, 0, 1)[None] for image in (picture, photo))
+        l1 = (picture - photo).abs().mean()
+        loss: Tensor = (1.0 - SSIM_WEIGHT) * l1 + SSIM_WEIGHT * (1.0 - fused_ssim(*planes))
+        return loss
+
+    return "fused_ssim", fused
+
+
 def gsplat_rows(
-    workload: str, scene: Scene, v_image: Arrays, seconds: float, device: str = "cuda"
+    workload: str,
+    scene: Scene,
+    v_image: Arrays,
+    seconds: float,
+    device: str = "cuda",
+    *,
+    photo: npt.NDArray[np.uint8] | None = None,
+    chosen: Callable[[list[Any]], list[Any]] = list,
 ) -> list[dict[str, Any]]:
-    """Times and errors of gsplat's ``rasterization``, forward and backward."""
+    """Times and errors of gsplat's ``rasterization``, forward and backward, and of a fit step.
+
+    The step has igsr's loss and torch's fused Adam, so that it does the work of igsr's step. Its
+    error is that of the gradients.
+
+    Args:
+        workload: name for the rows.
+        scene: with raw parameters if there is a photo.
+        v_image: gradients of the image for the pass backward.
+        seconds: time that each pass is repeated.
+        device: of torch.
+        photo: uint8 [H, W, 3 or 4] to fit; None leaves the step out.
+        chosen: chooses the crops that are compared with the reference.
+    """
     # Not a static import, which type checkers could not resolve if it is not installed.
     gsplat = importlib.import_module(NAME)
 
@@ -102,12 +141,29 @@ def gsplat_rows(
         in_sight = _core.project(*own, **scene.options(), backend="cpu")
         # gsplat does not render depth with color.
         v_colors = {**v_image, "v_depth": np.zeros_like(v_image["v_depth"])}
-        compared, _ = compare_picture(scene, in_sight, got, gradients, BOUND_3D["gpu"], v_colors)
+        compared, _ = compare_picture(
+            scene, in_sight, got, gradients, BOUND_3D["gpu"], v_colors, chosen
+        )
+        loss_name, loss = step_loss()
+        if photo is not None:
+            target = tensor(Shot(scene, photo).target())
+            optimizer = adam(parameters, fused=device == "cuda")
+
+            def step(repeats: int) -> dict[str, Any]:
+                began = synchronized()
+                optimizer.zero_grad()
+                loss(rendered()[0][0], target).backward()
+                optimizer.step()
+                return {"fit step": np.array([1e3 * (synchronized() - began)])}
+
+            times |= repeated(step, seconds)
     except Exception as error:  # of any kind; the report continues
         raise IgsrError(f"gsplat {getattr(gsplat, '__version__', '')} failed: {error}") from error
     errors = {
         "forward": errors_row("picture", compared.picture, compared.band),
         "backward": errors_row("gradients", compared.gradients, compared.band),
+        "fit step": errors_row("gradients", compared.gradients, compared.band)
+        | {"loss": loss_name},
     }
     return [
         {

@@ -36,7 +36,7 @@ def step_kernels(shot: Shot, repeats: int = STEPS_PER_STATE) -> dict[str, Any]:
         of whole steps on the device, "ms" the least time of a step that is not measured.
 
     Raises:
-        RuntimeError: there is no adapter, or it has no timestamps.
+        RuntimeError: no adapter is found, or it has no timestamps.
     """
     running = fitter(shot, "gpu")
     running.step(WARM_UP)

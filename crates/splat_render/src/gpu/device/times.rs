@@ -5,7 +5,7 @@ use crate::error::Result;
 use crate::fit_device::CommandTime;
 
 impl Gpu {
-    /// Runs lists of prepared commands, each command in a pass of its own, and waits for them.
+    /// Runs lists of prepared commands, each command in a separate pass, and waits for them.
     ///
     /// A command's time is the difference between the ends of its pass and of the pass before. Timestamps
     /// at the beginning of passes are less exact: llvmpipe writes them after the first dispatch.
