@@ -1,7 +1,7 @@
 """The page about accuracy: every implementation at every setting that trades error for time.
 
-The scene is small, so that the reference can be timed, too. There are two errors: that of the
-arithmetic, an implementation against the f64 reference at the same setting; and that of the
+The scene is small, so that the reference can be timed, too. There are two errors: of the
+arithmetic, an implementation against the f64 reference at the same setting; and of the
 setting, the f64 reference with it against the f64 reference without.
 """
 

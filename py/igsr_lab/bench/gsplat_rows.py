@@ -59,8 +59,8 @@ def gsplat_rows(
 ) -> list[dict[str, Any]]:
     """Times and errors of gsplat's ``rasterization``, forward and backward, and of a fit step.
 
-    The step has igsr's loss and torch's fused Adam, so that it does the work of igsr's step. Its
-    error is that of the gradients.
+    The step has igsr's loss and torch's fused Adam, as much work as igsr's step. Its row has the
+    gradients' error.
 
     Args:
         workload: name for the rows.
