@@ -24,7 +24,7 @@ def test_refine_writes_its_folder_and_resumes(few_photos, tmp_path, igsr_here):
     assert done.returncode == 0, done.stderr
     assert not stale.parent.exists()
     assert own.exists()
-    assert " rounds; stopped: " in done.stdout
+    assert "; stopped: " in done.stdout
     for name in ("report.html", "scene.html"):
         assert (out / name).is_file()
         assert name in done.stdout

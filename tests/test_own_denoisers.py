@@ -121,7 +121,7 @@ def test_the_command_denoise_takes_a_name(module, scene, igsr_here):
 
 
 def test_the_command_refine_takes_a_name(module, scene, igsr_here):
-    options = ("--out", "out", "--steps", 30, "--rounds", 1, "--backend", "cpu")
+    options = ("--out", "out", "--steps", 30, "--backend", "cpu")
     done = igsr_here("refine", "ball", *options, "--denoiser", "my_denoiser:make")
     assert done.returncode == 0, done.stderr
     report = json.loads((scene / "out/report.json").read_text())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from igsr.cameras import find
 from igsr.refinement import refine_photos, rounds
 from igsr.refinement.results import Stop, StopReason
 from igsr.refinement.selection import MIN_CONFIDENCE, select_views
+from igsr.refinement.settings import RefineSettings
 
 SEEDS = range(5)
 #: Stages of a refinement's events.
@@ -31,27 +33,96 @@ def test_rounds_by_a_truthful_denoiser_improve_test_views_on_average(few_photos)
     assert np.mean(gains) > 0.1, gains
 
 
+def test_events_cover_all_stages_and_count_up_to_the_end(helped):
+    refined, _, events = helped
+    assert refined.stop == Stop(StopReason.ROUNDS_DONE, 2)
+    for done in refined.rounds:
+        assert done.selected
+        assert len(done.selected) + len(done.rejected) <= rounds.CANDIDATES
+    stages = [event for event in events if event.path is None]
+    assert {event.stage for event in stages} == STAGES
+    parts = [event.part for event in stages]
+    assert parts == sorted(parts)
+    assert 0.9 < parts[-1] <= 1.0
+    assert [event.values["round"] for event in stages][-1] == 2
+
+
 def darker(buffers, photos):
     """A denoiser that darkens the render by a tenth, with full confidence."""
     color = np.clip(buffers.color, 0.0, 1.0)
     return 0.9 * color, np.ones(color.shape[:2], np.float32)
 
 
-@pytest.mark.parametrize("denoiser", [lying, darker])
+def undefined(buffers, photos):
+    """A denoiser that returns NaN."""
+    return np.full_like(buffers.color, np.nan), np.ones(buffers.color.shape[:2], np.float32)
+
+
+@pytest.mark.parametrize("denoiser", [lying, darker, undefined])
 def test_no_round_is_done_if_denoising_makes_the_photos_worse(
     few_photos, helped, rendered, tmp_path, denoiser
 ):
     refined = refine(few_photos, "auto", denoiser, out=tmp_path)
     assert refined.rounds == []
-    assert refined.stop.reason is StopReason.HARMFUL_DENOISER
-    assert refined.stop.count > 100.0 * refine_photos.MAX_ERROR_INCREASE
+    assert refined.stop == Stop(StopReason.HARMFUL_DENOISER)
     assert refined.splats is refined.first
     assert same(refined.splats, helped[0].first)
     assert rendered == [], "no novel view is rendered"
     page = (tmp_path / "report.html").read_text()
-    assert f"raises their RMSE by {refined.stop.count} %" in page
+    assert "the denoiser makes renders of the photos much worse" in page
     drawn = json.loads(page.split('id="cameras">')[1].split("</script>")[0])
     assert [kind for kind, _ in drawn] == [0, 0, 0], "photos alone, no novel view"
+
+
+def test_a_number_of_rounds_is_done_with_any_denoiser(few_photos):
+    refined = refine(few_photos, 1, darker, steps=20)
+    assert refined.stop == Stop(StopReason.ROUNDS_DONE, 1)
+
+
+def test_the_denoiser_is_checked_without_the_photo_and_behind_no_mask(few_photos, helped):
+    seen = []
+
+    def denoiser(buffers, photos):
+        seen.append((buffers.camera, [photo.camera for photo in photos]))
+        picture = np.clip(buffers.color, 0.0, 1.0)
+        picture[:, :20] = 0.0
+        return picture, np.ones(picture.shape[:2], np.float32)
+
+    half = np.ones((40, 40), np.bool_)
+    half[:, :20] = False
+    views = few_photos.train_views
+
+    def errors(views):
+        context = SimpleNamespace(
+            backend="cpu",
+            background=(1.0, 1.0, 1.0),
+            known_background=(1.0, 1.0, 1.0),
+            denoiser=denoiser,
+            progress=SimpleNamespace(report=lambda stage: None),
+        )
+        fitted = rounds.Reconstruction(list(views), helped[0].first, helped[0].first)
+        return rounds.denoiser_errors(context, fitted)
+
+    before, after = errors(views)
+    assert after > 2.0 * before > 0.0
+    assert [camera for camera, _ in seen] == [view.camera for view in views]
+    for camera, cameras in seen:
+        assert cameras == [view.camera for view in views if view.camera is not camera]
+    before, after = errors([replace(view, mask=half) for view in views])
+    assert before == pytest.approx(after)
+    seen.clear()
+    before, after = errors(views[:1])
+    assert after > before
+    assert seen[0][1] == [], "a single photo has no other"
+    seen.clear()
+    errors([views[k % 3] for k in range(20)])
+    assert len(seen) == rounds.CHECKED_VIEWS
+
+
+@pytest.mark.parametrize(("quality", "count"), [("draft", 1), ("normal", 2), ("high", 4)])
+def test_auto_rounds_depend_on_the_quality(quality, count):
+    assert RefineSettings(quality=quality).most_rounds == count
+    assert RefineSettings(quality=quality, rounds=3).most_rounds == 3
 
 
 def test_without_a_selected_view_nothing_is_fitted_again(few_photos, helped, monkeypatch):

@@ -18,8 +18,8 @@ class Event:
     """Progress of a run, or a file that it has just written.
 
     Attributes:
-        stage: "find cameras", "fit" and "score" of fits; "fit photos", "cross-validate", "denoise
-            novel views", "refit with novel views" and "score test views" of refinements;
+        stage: "find cameras", "fit" and "score" of fits; "fit photos", "denoise novel
+            views", "refit with novel views" and "score test views" of refinements;
             ``CAMERAS_FOUND``, ``SCENE_WRITTEN`` or ``NOTE``.
         done, total: steps or photos of the stage.
         message: details, in one line.

@@ -44,23 +44,24 @@ from igsr.refinement.rounds import (
     Reconstruction,
     Select,
     denoise_views,
-    error_increase,
+    denoiser_errors,
     fit_all,
     propose_views,
     refit,
     score_test_views,
     select_candidates,
 )
-from igsr.refinement.selection import Rejected, select_views
+from igsr.refinement.selection import PHOTO_ERROR, Rejected, select_views
 from igsr.refinement.settings import AUTO, RefineSettings
 from igsr.rendering.backdrop import wants_backdrop
 from igsr.run import Run, open_run
 
 #: "auto" does no round if this many photos see the same place: rounds gained nothing there.
 ENOUGH_PHOTOS = 30.0
-#: No round is done if denoising raises the RMSE of renders of the photos by more than this
-#: fraction. The denoiser of igsr raises it by up to 0.3, because fits reproduce their photos well.
-MAX_ERROR_INCREASE = 0.5
+#: "auto" does no round if denoising raises the RMSE of renders of the photos by more than this
+#: factor, and above ``PHOTO_ERROR``. igsr's denoiser raises it by up to 1.3, because fits reproduce
+#: their photos well.
+MAX_ERROR_FACTOR = 1.5
 
 
 def refine(
@@ -91,8 +92,9 @@ def refine(
     Args:
         photos: a capture; or a path: a folder of photos or a video, whose cameras are found if it
             has none.
-        rounds: maximum number of rounds; "auto" is 1, 2 or 4 for quality "draft", "normal" or
-            "high", and none if 30 photos see the same place.
+        rounds: number of rounds; "auto" is 1, 2 or 4 for quality "draft", "normal" or "high", and
+            none if 30 photos see the same place or if denoising makes renders of the photos much
+            worse. Rounds end early if no novel view is found or selected.
         out: folder for scene.ply, scene.html, cameras.json, report.html, report.json, views.png,
             rounds/, checkpoints/, and cameras.npz with found cameras; written after every round.
             None writes nothing.
@@ -234,12 +236,15 @@ def _stop_before(context: Context, whole: Reconstruction) -> Stop | None:
     settings = context.settings
     if context.progress.round > settings.most_rounds:
         return Stop(StopReason.ROUNDS_DONE, settings.most_rounds)
+    if settings.rounds != AUTO or context.progress.round > 1:
+        return None
     overlap = photo_statistics(whole.photos).overlap
-    if settings.rounds == AUTO and overlap >= ENOUGH_PHOTOS:
+    if overlap >= ENOUGH_PHOTOS:
         return Stop(StopReason.ENOUGH_PHOTOS, round(overlap))
-    increase = error_increase(context, whole) if context.progress.round == 1 else 0.0
-    if increase > MAX_ERROR_INCREASE:
-        return Stop(StopReason.HARMFUL_DENOISER, round(100.0 * increase))
+    before, after = denoiser_errors(context, whole)
+    # A denoiser that returns NaN is harmful, too.
+    if not after <= max(PHOTO_ERROR, MAX_ERROR_FACTOR * before):
+        return Stop(StopReason.HARMFUL_DENOISER)
     return None
 
 

@@ -40,8 +40,8 @@ class Stop:
     Attributes:
         reason: the reason.
         count: number of rounds (``ROUNDS_DONE``), of photos that see the same place
-            (``ENOUGH_PHOTOS``) or of novel views that were rejected (``NONE_SELECTED``); percent
-            (``HARMFUL_DENOISER``); 0 (``NO_NOVEL_VIEW``).
+            (``ENOUGH_PHOTOS``) or of novel views that were rejected (``NONE_SELECTED``); 0
+            otherwise.
     """
 
     reason: StopReason
@@ -56,8 +56,8 @@ class Stop:
             "novel views would add nothing",
             StopReason.NO_NOVEL_VIEW: "there is no novel view near the photos",
             StopReason.NONE_SELECTED: f"{views} had too little confidence or gain",
-            StopReason.HARMFUL_DENOISER: "denoising renders of the photos raises their RMSE by "
-            f"{self.count} %",
+            StopReason.HARMFUL_DENOISER: "the denoiser makes renders of the photos much worse; use "
+            "another, or give the number of rounds to use it anyway",
         }[self.reason]
 
 
@@ -133,4 +133,6 @@ class Refined(ArrayEquality, NotebookPicture):
     def __repr__(self) -> str:
         """The rounds, the scene and why it stopped, in one line."""
         stopped = "unfinished" if self.stop is None else str(self.stop)
-        return f"Refined({len(self.rounds)} rounds, {len(self.splats)} splats; {stopped})"
+        count = len(self.rounds)
+        rounds = f"{count} round{'' if count == 1 else 's'}"
+        return f"Refined({rounds}, {len(self.splats)} splats; {stopped})"

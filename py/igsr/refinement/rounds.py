@@ -39,8 +39,8 @@ from igsr.splats import Splats
 #: Novel views rendered in a round, and the maximum number that is added.
 CANDIDATES = 24
 MAX_SELECTED = 16
-#: Maximum number of photos whose renders are denoised to check the denoiser.
-CHECKED_PHOTOS = 8
+#: Maximum number of views whose renders are denoised to check the denoiser.
+CHECKED_VIEWS = 8
 #: Time of rendering and denoising novel views, as a fraction of a fit's time.
 NOVEL_VIEWS_WORK = 0.4
 
@@ -161,28 +161,29 @@ def denoise_views(
     return candidates
 
 
-def error_increase(context: Context, fitted: Reconstruction) -> float:
-    """By which fraction denoising increases the RMSE of renders of the photos; 0 if it does not.
+def denoiser_errors(context: Context, fitted: Reconstruction) -> tuple[float, float]:
+    """RMSE of renders of the photos, before and after they are denoised; colors are in [0, 1].
 
-    The denoiser does not get the photo itself.
+    The denoiser does not get the photo itself. Masked pixels do not count.
     """
     splats, photos, backend = fitted.splats, fitted.photos, context.backend
     support = photo_support(splats, photos, backend)
     sources = NearSources(splats, photos, context.background, backend)
-    before, after = [], []
-    for photo in photos[:: -(-len(photos) // CHECKED_PHOTOS)]:
-        camera = photo.camera
+    sums, count = np.zeros(2), 0
+    for k in np.linspace(0, len(photos) - 1, min(len(photos), CHECKED_VIEWS)).round().astype(int):
+        camera, mask = photos[k].camera, photos[k].mask
         buffers = render_buffers(splats, camera, support, context.known_background, backend)
         others = [source for source in sources.of(camera) if source.camera is not camera]
         denoised, _ = denoise(buffers, others, context.denoiser)
-        true = over_background(photo.image, context.background) / np.float32(255.0)
-        shown = np.ones(true.shape[:2], np.bool_) if photo.mask is None else photo.mask
+        true = over_background(photos[k].image, context.background) / np.float32(255.0)
+        shown = np.ones(true.shape[:2], np.bool_) if mask is None else mask
         render = np.clip(np.nan_to_num(buffers.color), 0.0, 1.0)
-        before.append(np.square(render - true)[shown])
-        after.append(np.square(denoised - true)[shown])
+        for at, picture in enumerate((render, denoised)):
+            sums[at] += np.square(picture - true)[shown].sum(dtype=np.float64)
+        count += 3 * int(shown.sum())
         context.progress.report("novel_views")
-    old, new = (float(np.concatenate(errors).mean()) for errors in (before, after))
-    return max(0.0, np.sqrt(new / max(old, 1e-12)) - 1.0)
+    before, after = np.sqrt(sums / count)
+    return float(before), float(after)
 
 
 def select_candidates(

@@ -62,10 +62,13 @@ def device_report(
             on_row(f"{name} on {backend}")
             work = partial(pipeline_rows, name, scene, backend, settings.seed, settings.seconds)
             report["rows"] += rows_or_reason(name, backend, work)
-    kernels: list[dict[str, Any]] = []
+    report["kernels"] = []
     if "gpu" in settings.backends:
         on_row("the kernels of a fit step")
-        kernels = kernels_or_none(settings.seed)
+        try:
+            report["kernels"] = kernel_tables(settings.seed)
+        except RuntimeError as error:  # as the GPU raises
+            report["rows"].append(not_run("kernels", "gpu", str(error)))
         for size in SIZES:
             on_row(f"the viewer at {size[0]} x {size[1]}")
             work = partial(viewer_rows, size, settings.seed, small)
@@ -82,7 +85,7 @@ def device_report(
         for count, side in SIZES_OF_STEPS:
             work = partial(gsplat_steps, settings, count, side)
             report["rows"] += rows_or_reason("W4", NAME, work, count)
-    return {"device": device, "kernels": kernels, **report}
+    return {"device": device, **report}
 
 
 def gsplat_steps(settings: Settings, count: int, side: int) -> list[dict[str, Any]]:
@@ -91,14 +94,6 @@ def gsplat_steps(settings: Settings, count: int, side: int) -> list[dict[str, An
     v_image = upstream(settings.seed, side, side)
     options: dict[str, Any] = {"photo": shot.photo, "chosen": evenly_chosen}
     return gsplat_rows("W4", shot.scene, v_image, settings.seconds, **options)
-
-
-def kernels_or_none(seed: int) -> list[dict[str, Any]]:
-    """Times of kernels; [] if the device has no timestamps or fails, as other rows show."""
-    try:
-        return kernel_tables(seed)
-    except RuntimeError:
-        return []
 
 
 def json_beside(path: Path) -> Path:
@@ -130,7 +125,7 @@ def _cells(row: dict[str, Any]) -> dict[str, Any]:
 
     return {
         "workload": row["workload"],
-        "pass": row["pass"],
+        "pass": row["pass"] + (f", loss by {row['loss']}" if "loss" in row else ""),
         "backend": row["backend"],
         "splats": f"{row['splats']:,}".replace(",", " "),
         "size": f"{row['width']}×{row['height']}",

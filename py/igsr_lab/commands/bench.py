@@ -143,7 +143,14 @@ def bench_command(
         }
         if profile:
             _refuse(
-                {**given, "--compare": compare, "--accuracy": accuracy, "--plot": plot},
+                {
+                    **given,
+                    "--workload": workloads,
+                    "--backend": backends,
+                    "--compare": compare,
+                    "--accuracy": accuracy,
+                    "--plot": plot,
+                },
                 "--profile runs no workloads",
             )
         if compare is not None:

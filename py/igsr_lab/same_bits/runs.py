@@ -253,7 +253,7 @@ def resumed(inputs: Inputs) -> Results:
 
 
 def refinements(inputs: Inputs) -> Results:
-    """Refinements: two rounds, one whose novel views are all rejected, and one that is resumed."""
+    """Refinements: two rounds, a harmful denoiser, and a run that is resumed."""
     options: dict[str, Any] = {"steps": 600, "backend": "cpu", "seed": 0}
     cleaner = Truthful(inputs.ball)
     colors = np.full((len(inputs.ball), 3), 128, np.uint8)
@@ -268,10 +268,10 @@ def refinements(inputs: Inputs) -> Results:
     igsr.refine(capture, 1, denoiser=cleaner, out=out, **options)
     refined = igsr.refine(capture, 2, denoiser=cleaner, out=out, resume=True, **options)
     yield "resumed.splats", [refined.first, refined.splats, len(refined.rounds)]
-    out = inputs.folder / "rejected"
+    out = inputs.folder / "harmful"
     refined = igsr.refine(capture, "auto", denoiser=inverted, out=out, **options)
-    yield "rejected.splats", [refined.first, refined.splats, len(refined.rounds)]
-    yield from prefixed("rejected", refinement_files(out))
+    yield "harmful.splats", [refined.first, refined.splats, len(refined.rounds)]
+    yield from prefixed("harmful", refinement_files(out))
 
 
 class Truthful:
@@ -288,7 +288,7 @@ class Truthful:
 
 
 def inverted(render: Any, photos: Sequence[Any]) -> tuple[np.ndarray, np.ndarray]:
-    """A denoiser that makes all worse and is sure of it: its views are rejected."""
+    """A denoiser that makes all worse and is sure of it: no round is done."""
     color = np.clip(render.color, 0.0, 1.0)
     return 1.0 - color, np.ones(color.shape[:2], np.float32)
 
