@@ -120,9 +120,10 @@ def test_the_denoiser_is_checked_without_the_photo_and_behind_no_mask(few_photos
 
 
 @pytest.mark.parametrize(("quality", "count"), [("draft", 1), ("normal", 2), ("high", 4)])
-def test_auto_rounds_depend_on_the_quality(quality, count):
-    assert RefineSettings(quality=quality).most_rounds == count
-    assert RefineSettings(quality=quality, rounds=3).most_rounds == 3
+def test_auto_rounds_depend_on_alpha_and_quality(quality, count):
+    settings = RefineSettings(quality=quality)
+    assert (settings.most_rounds(True), settings.most_rounds(False)) == (count, 1)
+    assert RefineSettings(quality=quality, rounds=3).most_rounds(False) == 3
 
 
 def test_without_a_selected_view_nothing_is_fitted_again(few_photos, helped, monkeypatch):

@@ -43,7 +43,9 @@ def refine_command(
     example: ExampleOption = False,
     rounds: Annotated[
         str,
-        option("--rounds", metavar="auto|N", help="Number of rounds; auto: 1, 2 or 4 by quality."),
+        option(
+            "--rounds", metavar="auto|N", help="Number of rounds; auto: 1, or 1 to 4 with alpha."
+        ),
     ] = "auto",
     quality: QualityOption = "normal",
     max_size: FitSizeOption = None,

@@ -26,7 +26,7 @@ from igsr.capture.photo_checks import check_photos
 from igsr.capture.photo_folder import FRAMES
 from igsr.denoiser import Denoiser, NetworkDenoiser, load_network
 from igsr.errors import IgsrError
-from igsr.evaluation.scores import check_masks, default_background
+from igsr.evaluation.scores import check_masks, default_background, known_background
 from igsr.fitting.announcement import announcement
 from igsr.fitting.fitter import fit_device
 from igsr.fitting.followed_run import FollowedRun
@@ -92,7 +92,7 @@ def refine(
     Args:
         photos: a capture; or a path: a folder of photos or a video, whose cameras are found if it
             has none.
-        rounds: number of rounds; "auto" is 1, 2 or 4 for quality "draft", "normal" or "high", and
+        rounds: number of rounds; "auto" is one, or for photos with alpha 1, 2 or 4 by quality, and
             none if 30 photos see the same place or if denoising makes renders of the photos much
             worse. Rounds end early if no novel view is found or selected.
         out: folder for scene.ply, scene.html, cameras.json, report.html, report.json, views.png,
@@ -150,7 +150,7 @@ def refine(
                     given={"steps": steps},
                     backend=name,
                     cameras_known=cameras_known,
-                    rounds=settings.most_rounds,
+                    rounds=settings.most_rounds(seen.channels == 4),
                 ):
                     run.note(sentence)
 
@@ -166,6 +166,7 @@ def refine(
         checkpoints = _prepared_folder(run)
         if followed is not None:
             followed.show(capture, default_background(capture))
+        most = settings.most_rounds(known_background(capture.views) is not None)
         context = Context(
             capture=capture,
             settings=settings,
@@ -176,7 +177,7 @@ def refine(
             has_backdrop=wants_backdrop(capture.train_views),
             checkpoints=checkpoints,
             resume=resume,
-            progress=RefineProgress(run, 1.0 + settings.most_rounds * (1.0 + NOVEL_VIEWS_WORK)),
+            progress=RefineProgress(run, 1.0 + most * (1.0 + NOVEL_VIEWS_WORK)),
         )
         return _run_rounds(context, run, tuple(loaded.not_placed))
 
@@ -234,8 +235,9 @@ def _run_rounds(context: Context, run: Run, not_placed: tuple[str, ...]) -> Refi
 def _stop_before(context: Context, whole: Reconstruction) -> Stop | None:
     """Why there is no further round; None if there is one."""
     settings = context.settings
-    if context.progress.round > settings.most_rounds:
-        return Stop(StopReason.ROUNDS_DONE, settings.most_rounds)
+    most = settings.most_rounds(context.known_background is not None)
+    if context.progress.round > most:
+        return Stop(StopReason.ROUNDS_DONE, most)
     if settings.rounds != AUTO or context.progress.round > 1:
         return None
     overlap = photo_statistics(whole.photos).overlap

@@ -11,9 +11,10 @@ from igsr.errors import IgsrError
 from igsr.fitting.presets import Quality
 from igsr.fitting.settings import MAX_STEPS, ExposureMode, TransientMode
 
-#: ``AUTO_ROUNDS`` by quality, or none if there are enough photos.
+#: One round, or ``ALPHA_ROUNDS`` of photos with alpha.
 AUTO = "auto"
-AUTO_ROUNDS: dict[Quality, int] = {"draft": 1, "normal": 2, "high": 4}
+#: By quality. Further rounds gain on objects, not on photographs (docs/research/refinement.md).
+ALPHA_ROUNDS: dict[Quality, int] = {"draft": 1, "normal": 2, "high": 4}
 
 
 def _read_rounds(name: str, value: Any) -> int | str:
@@ -51,7 +52,8 @@ class RefineSettings:
     def __post_init__(self) -> None:
         validate(self)
 
-    @property
-    def most_rounds(self) -> int:
-        """Maximum number of rounds."""
-        return AUTO_ROUNDS[self.quality] if isinstance(self.rounds, str) else self.rounds
+    def most_rounds(self, has_alpha: bool) -> int:
+        """Maximum number of rounds, for photos with or without alpha."""
+        if isinstance(self.rounds, str):
+            return ALPHA_ROUNDS[self.quality] if has_alpha else 1
+        return self.rounds
