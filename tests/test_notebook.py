@@ -15,7 +15,7 @@ splats.show(height=300)
 REFINED = """
 from igsr.refinement.results import Refined, Round
 capture = igsr.Capture("photos", [])
-done = Round([], [], {}, {}, True, splats, None)
+done = Round([], [], splats, None)
 Refined(splats, splats, None, capture, [done], None, [], {}).show(height=300)
 """
 
