@@ -33,7 +33,7 @@ def step_kernels(shot: Shot, repeats: int = STEPS_PER_STATE) -> dict[str, Any]:
     Returns:
         "kernels": for each kernel its "name", "calls" in a step, and the "least" and "median"
         milliseconds of all calls in a step, the slowest kernel first. "device_ms" is the median
-        of whole steps on the device, "ms" the least time of a step that is not measured.
+        of whole steps on the device, "ms" the mean time of steps that are not measured.
 
     Raises:
         RuntimeError: no adapter is found, or it has no timestamps.
