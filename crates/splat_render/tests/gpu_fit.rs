@@ -396,9 +396,13 @@ fn steps_allocate_nothing_and_memory_grows_as_stated() {
         // The state on the device is read for density control and checkpoints, not in steps.
         fit.loss().unwrap();
         let (made, _) = gpu.made();
+        let writes = gpu.host_writes();
         for step in 11..=100 {
             fit.step(&input(&capture, step, 0.0)).unwrap();
         }
+        // One a step, and one when waiting colors are brought up to date.
+        let written = gpu.host_writes() - writes;
+        assert!((90..=92).contains(&written), "the host wrote {written} times in 90 steps");
         let (made_later, _) = gpu.made();
         assert_eq!(made_later, made, "steps 11 to 100 made buffers, bind groups or pipelines");
         bytes - before

@@ -95,7 +95,7 @@ impl SplatBins {
             order: pair("depth order")?,
             offsets: gpu.bindable("offsets", words(splats) + 4)?,
             segment_sums: gpu.buffer("segment sums", words(gpu.segments()))?,
-            histogram: gpu.buffer("histogram", words(gpu.segments() << gpu.digit_bits()))?,
+            histogram: gpu.zeroed("histogram", words(histogram_rows(gpu) << gpu.digit_bits()))?,
             dispatches: gpu.buffer("dispatches", 24)?,
             status,
         })
@@ -136,7 +136,7 @@ impl SplatBins {
             chunk: ALL_SPLATS,
             is_first: 1,
             keeps_culled: u32::from(keeps_culled),
-            shift: 0,
+            ..SortPass::zeroed()
         };
         self.sort_ops(gpu, first, passes, &self.keys, &self.order)
     }
@@ -242,6 +242,8 @@ impl SplatBins {
             let uniform = gpu.uniform(&SortPass {
                 shift: pass * gpu.digit_bits(),
                 is_first: if pass == 0 { first.is_first } else { 0 },
+                // The pass before, of this sort or the last, has used another row of sums.
+                sums: if pass + 1 == passes { 2 } else { pass % 2 },
                 ..first
             });
             let (from, to) = ((pass % 2) as usize, ((pass + 1) % 2) as usize);
@@ -308,9 +310,21 @@ impl SplatBins {
     }
 }
 
-/// Passes that order the ids of `tiles` tiles and the one behind them.
+/// As in bin_sort_wide.wgsl.
+const SUM_ROWS: u32 = 36;
+
+/// Rows of counts in the histogram; the sort by eight bits has sums of segments, too.
+fn histogram_rows(gpu: &Gpu) -> u32 {
+    gpu.segments() + if gpu.digit_bits() == 8 { 3 * SUM_ROWS } else { 0 }
+}
+
+/// Passes that order the ids of `tiles` tiles and the one behind them; the sort by eight bits needs two.
 fn sort_passes(tiles: u32, digit_bits: u32) -> u32 {
-    (u32::BITS - tiles.leading_zeros()).div_ceil(digit_bits).max(1)
+    (u32::BITS - tiles.leading_zeros()).div_ceil(digit_bits).max(if digit_bits == 8 {
+        2
+    } else {
+        1
+    })
 }
 
 impl PairBins {

@@ -168,6 +168,7 @@ pub(super) struct SortPass {
     pub chunk: u32,
     pub is_first: u32,
     pub keeps_culled: u32,
+    pub sums: u32,
 }
 
 /// `SortPass::chunk` for the sort of all splats by depth.

@@ -42,7 +42,7 @@ pub(super) fn draw(
     let words = |label, count| words(gpu, label, count);
     let row_bytes = GEOMETRY as u64 * 4;
     let drawn = gpu.bindable("geometry", u64::from(n + fresh) * row_bytes)?;
-    let copy = Op::Copy(geometry.clone(), drawn.clone(), 0, u64::from(n) * row_bytes);
+    let copy = Op::copy(geometry, &drawn, 0, u64::from(n) * row_bytes);
     let every = sampled_every(n as usize) as u32;
     let first = Run {
         splats: n,

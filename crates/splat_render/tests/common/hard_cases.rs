@@ -176,7 +176,7 @@ pub fn tile_edges_are_seamless(stages: &dyn Stages<f32>, bounds: Bounds) {
 }
 
 /// Hard 2D splats, by name.
-fn hard_splats_2d() -> Vec<(&'static str, Projected<f32>)> {
+pub fn hard_splats_2d() -> Vec<(&'static str, Projected<f32>)> {
     let mut rng = rng(2);
     let mut cases = Vec::new();
     let mut equal = random_projected(&mut rng, 200, 40, 40, 4.0);

@@ -64,8 +64,16 @@ pub fn rng(seed: u64) -> Pcg64 {
 }
 
 /// Any adapter, software ones included; if there is none, the test fails with the error's sentence.
+/// `make test-long` runs the tests of the GPU with each build of the kernels: `IGSR_TEST_GPU` is
+/// `discrete` or `no-subgroups`.
 pub fn gpu() -> Gpu {
-    Gpu::new(true).unwrap_or_else(|e| panic!("{e}"))
+    let gpu = Gpu::new(true).unwrap_or_else(|e| panic!("{e}"));
+    match std::env::var("IGSR_TEST_GPU").as_deref() {
+        Err(_) => gpu,
+        Ok("discrete") => gpu.as_discrete(),
+        Ok("no-subgroups") => gpu.without_subgroups(),
+        Ok(other) => panic!("IGSR_TEST_GPU is {other}, not discrete or no-subgroups"),
+    }
 }
 
 /// Runs work on a number of threads.

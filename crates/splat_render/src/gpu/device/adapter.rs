@@ -179,9 +179,11 @@ impl Gpu {
             plans_only: false,
             made: Default::default(),
             host_bytes: AtomicU64::new(0),
+            host_writes: AtomicU64::new(0),
             binding_limit,
             groups_max,
             build,
+            checks_shaders: std::env::var_os("IGSR_GPU_CHECKS").is_some_and(|value| value == "1"),
             list_limit: list_limit(software, build.subgroups),
         };
         gpu.check()?;

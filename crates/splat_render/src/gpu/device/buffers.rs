@@ -1,6 +1,7 @@
 //! Buffers: made, filled, and read back.
 
 use std::sync::Arc;
+use std::sync::atomic::Ordering;
 
 use super::commands::Op;
 use super::{Gpu, note};
@@ -50,6 +51,16 @@ impl Gpu {
         Ok(buffer)
     }
 
+    /// A buffer of zeros.
+    pub(in crate::gpu) fn zeroed(&self, label: &str, bytes: u64) -> Result<wgpu::Buffer> {
+        let buffer = self.buffer(label, bytes)?;
+        let mut encoder = self.device.create_command_encoder(&Default::default());
+        encoder.clear_buffer(&buffer, 0, None);
+        self.queue.submit([encoder.finish()]);
+        self.check()?;
+        Ok(buffer)
+    }
+
     pub(in crate::gpu) fn bindable_bytes(&self, label: &str, bytes: u64) -> Result<()> {
         if bytes > self.binding_limit {
             return Err(self.error(&format!(
@@ -87,6 +98,7 @@ impl Gpu {
 
     pub(in crate::gpu) fn write(&self, buffer: &wgpu::Buffer, offset: u64, bytes: &[u8]) {
         self.count_host(bytes.len() as u64);
+        self.host_writes.fetch_add(1, Ordering::Relaxed);
         if !self.plans_only {
             self.queue.write_buffer(buffer, offset, bytes);
         }
@@ -104,6 +116,17 @@ impl Gpu {
         self.count_host(size_of::<T>() as u64);
         self.queue.write_buffer(&buffer, 0, bytemuck::bytes_of(contents));
         buffer
+    }
+
+    /// A buffer that the host writes and commands copy from.
+    pub(in crate::gpu) fn inputs(&self, bytes: u64) -> wgpu::Buffer {
+        self.count(bytes);
+        self.device.create_buffer(&wgpu::BufferDescriptor {
+            label: Some("inputs"),
+            size: bytes.next_multiple_of(4),
+            usage: wgpu::BufferUsages::COPY_SRC | wgpu::BufferUsages::COPY_DST,
+            mapped_at_creation: false,
+        })
     }
 
     /// Runs prepared commands and brings back the first `bytes` of each buffer.

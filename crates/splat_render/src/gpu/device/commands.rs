@@ -52,17 +52,26 @@ pub(in crate::gpu) enum Op {
         groups: Groups,
     },
     Clear(wgpu::Buffer),
-    /// Copies bytes (last field) from the start of the first buffer to an offset in the second.
-    Copy(wgpu::Buffer, wgpu::Buffer, u64, u64),
+    /// Copies `bytes` bytes between offsets in two buffers.
+    Copy {
+        from: (wgpu::Buffer, u64),
+        to: (wgpu::Buffer, u64),
+        bytes: u64,
+    },
 }
 
 impl Op {
+    /// Copies the first bytes of a buffer to an offset in another.
+    pub fn copy(from: &wgpu::Buffer, to: &wgpu::Buffer, offset: u64, bytes: u64) -> Self {
+        Self::Copy { from: (from.clone(), 0), to: (to.clone(), offset), bytes }
+    }
+
     /// The entry point of the kernel, "clear" or "copy".
     pub fn name(&self) -> &'static str {
         match self {
             Self::Dispatch { kernel, .. } => kernel.entry(),
             Self::Clear(_) => "clear",
-            Self::Copy(..) => "copy",
+            Self::Copy { .. } => "copy",
         }
     }
 }
@@ -72,12 +81,21 @@ impl Gpu {
         self.pipelines[kernel as usize].get_or_init(|| {
             let (source, entry) = (kernel.source(), kernel.entry());
             self.count(0);
-            let module = self.device.create_shader_module(wgpu::ShaderModuleDescriptor {
+            let text = self.injected.text(source.text(self.build));
+            let descriptor = wgpu::ShaderModuleDescriptor {
                 label: Some(source.name),
-                source: wgpu::ShaderSource::Wgsl(
-                    self.injected.text(source.text(self.build)).into(),
-                ),
-            });
+                source: wgpu::ShaderSource::Wgsl(text.into()),
+            };
+            let checks = wgpu::ShaderRuntimeChecks {
+                bounds_checks: self.checks_shaders,
+                force_loop_bounding: self.checks_shaders,
+                int_div_checks: self.checks_shaders,
+                ..wgpu::ShaderRuntimeChecks::checked()
+            };
+            // SAFETY: the text is this crate's. Its loops count to an end, as a test of gpu/kernels
+            // asserts; it divides integers by constants and sizes above 0; and the counts on the device
+            // by which it indexes are at most the sizes of the buffers.
+            let module = unsafe { self.device.create_shader_module_trusted(descriptor, checks) };
             let bindings = bind_group_layout(&self.device, source);
             let layout = self.device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
                 label: Some(source.name),
@@ -92,7 +110,8 @@ impl Gpu {
                 entry_point: Some(entry),
                 compilation_options: wgpu::PipelineCompilationOptions {
                     constants: &constants,
-                    ..Default::default()
+                    // Every kernel writes workgroup memory before it reads it.
+                    zero_initialize_workgroup_memory: self.checks_shaders,
                 },
                 cache: None,
             });
@@ -161,8 +180,8 @@ impl Gpu {
             match first {
                 Op::Dispatch { .. } => {}
                 Op::Clear(buffer) => encoder.clear_buffer(buffer, 0, None),
-                Op::Copy(from, to, offset, bytes) => {
-                    encoder.copy_buffer_to_buffer(from, 0, to, *offset, *bytes);
+                Op::Copy { from, to, bytes } => {
+                    encoder.copy_buffer_to_buffer(&from.0, from.1, &to.0, to.1, *bytes);
                 }
             }
             let run = rest.iter().take_while(|op| matches!(op, Op::Dispatch { .. })).count();

@@ -7,7 +7,7 @@ pub fn needed_limits() -> wgpu::Limits {
     wgpu::Limits {
         max_storage_buffers_per_shader_stage: 8,
         max_uniform_buffers_per_shader_stage: 3,
-        max_compute_workgroup_storage_size: 9600,
+        max_compute_workgroup_storage_size: 14_200,
         max_compute_invocations_per_workgroup: 256,
         max_compute_workgroup_size_x: 256,
         max_compute_workgroup_size_y: 1,

@@ -41,11 +41,14 @@ pub struct Gpu {
     /// Buffers, bind groups and pipelines made so far, and the buffers' bytes.
     made: [AtomicU64; 2],
     host_bytes: AtomicU64,
+    host_writes: AtomicU64,
     /// Most bytes that a storage binding may have.
     pub(super) binding_limit: u64,
     /// Most workgroups in one dimension of a dispatch.
     pub(super) groups_max: u32,
     build: Build,
+    /// Whether naga adds checks of indices, divisors and loops to the kernels.
+    checks_shaders: bool,
     /// Pairs of a tile that one dispatch of the rasterize kernels walks.
     pub(super) list_limit: u32,
 }
@@ -201,6 +204,11 @@ impl Gpu {
     /// How many bytes went from the host to the device or back so far.
     pub fn host_bytes(&self) -> u64 {
         self.host_bytes.load(Ordering::Relaxed)
+    }
+
+    /// How many times the host wrote to a buffer so far.
+    pub fn host_writes(&self) -> u64 {
+        self.host_writes.load(Ordering::Relaxed)
     }
 
     fn count_host(&self, bytes: u64) {

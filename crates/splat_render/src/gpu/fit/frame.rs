@@ -75,7 +75,7 @@ impl Frame {
     /// Copies a photo to the loss's input buffer.
     pub fn copy_photo(&self, rgba: &wgpu::Buffer) -> Op {
         let bytes = u64::from(self.width) * u64::from(self.height) * 4;
-        Op::Copy(rgba.clone(), self.loss.photo.clone(), 0, bytes)
+        Op::copy(rgba, &self.loss.photo, 0, bytes)
     }
 
     /// Makes the commands of a whole step, unless they are there already.

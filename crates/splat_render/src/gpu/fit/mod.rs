@@ -48,6 +48,18 @@ use scene::{Scene, pair_buffers};
 /// Steps that may be under way before the host looks whether all pairs fitted.
 const STEPS_AHEAD: usize = 16;
 
+/// Offset of the status's overflow, bytes.
+const OVERFLOW_AT: u64 = std::mem::offset_of!(StatusHead, overflow) as u64;
+
+/// Most bytes of a step's [`Inputs`].
+const INPUT_BYTES: u64 = (size_of::<View>()
+    + size_of::<Step>()
+    + size_of::<[u32; 2]>()
+    + size_of::<[f32; 4]>()
+    + size_of::<ExposureUniform>()
+    + size_of::<DepthStep>()
+    + 2 * size_of::<u32>()) as u64;
+
 /// Fits on the GPU.
 #[derive(Debug)]
 pub struct GpuFit {
@@ -61,6 +73,7 @@ pub struct GpuFit {
     color_steps: wgpu::Buffer,
     exposure: wgpu::Buffer,
     depth: wgpu::Buffer,
+    inputs: wgpu::Buffer,
     scene: Option<Scene>,
     /// MCMC's table of shares; None until density control runs.
     shares: Option<wgpu::Buffer>,
@@ -96,6 +109,29 @@ struct PhotoDepth {
     scale: f64,
 }
 
+/// Uniforms of a step and words of the status, which the host writes at once.
+#[derive(Debug)]
+struct Inputs<'a> {
+    buffer: &'a wgpu::Buffer,
+    bytes: Vec<u8>,
+    copies: Vec<Op>,
+}
+
+impl Inputs<'_> {
+    fn add(&mut self, to: &wgpu::Buffer, offset: u64, bytes: &[u8]) {
+        let from = (self.buffer.clone(), self.bytes.len() as u64);
+        let to = (to.clone(), offset);
+        self.copies.push(Op::Copy { from, to, bytes: bytes.len() as u64 });
+        self.bytes.extend_from_slice(bytes);
+    }
+
+    /// Writes them, and returns the commands that bring them to their places.
+    fn send(self, gpu: &Gpu) -> Vec<Op> {
+        gpu.write(self.buffer, 0, &self.bytes);
+        self.copies
+    }
+}
+
 impl GpuFit {
     /// A fitting device without photos or splats yet.
     pub fn new(gpu: Arc<Gpu>) -> Self {
@@ -105,6 +141,7 @@ impl GpuFit {
             color_steps: gpu.uniform(&<ColorSteps as bytemuck::Zeroable>::zeroed()),
             exposure: gpu.uniform(&<ExposureUniform as bytemuck::Zeroable>::zeroed()),
             depth: gpu.uniform(&<DepthStep as bytemuck::Zeroable>::zeroed()),
+            inputs: gpu.inputs(INPUT_BYTES),
             gpu,
             photos: Vec::new(),
             frames: Vec::new(),
@@ -184,31 +221,36 @@ impl GpuFit {
             photo.weight,
             photo.weights.is_some(),
         );
-        let gpu = &self.gpu;
-        gpu.write(&self.view, 0, bytemuck::bytes_of(&view));
-        gpu.write(&self.step, 0, bytemuck::bytes_of(&step));
+        let mut inputs = Inputs { buffer: &self.inputs, bytes: Vec::new(), copies: Vec::new() };
+        inputs.add(&self.view, 0, bytemuck::bytes_of(&view));
+        inputs.add(&self.step, 0, bytemuck::bytes_of(&step));
         let head = [waiting as u32, scene.adam.moving];
-        gpu.write(&self.color_steps, 0, bytemuck::bytes_of(&head));
+        inputs.add(&self.color_steps, 0, bytemuck::bytes_of(&head));
         if !adam.is_frozen() {
             let (offset, entry) = ColorSteps::entry(waiting, &ColorStep::new(&adam));
-            gpu.write(&self.color_steps, offset, bytemuck::bytes_of(&entry));
+            inputs.add(&self.color_steps, offset, bytemuck::bytes_of(&entry));
         }
         if let Some(exposure) = &input.exposure {
             let uniform = ExposureUniform::from(exposure);
-            gpu.write(&self.exposure, 0, bytemuck::bytes_of(&uniform));
+            inputs.add(&self.exposure, 0, bytemuck::bytes_of(&uniform));
+        }
+        if again {
+            inputs.add(&scene.bins.status, OVERFLOW_AT, bytemuck::bytes_of(&0u32));
         }
         let step_at = std::mem::offset_of!(StatusHead, step) as u64;
-        gpu.write(&scene.bins.status, step_at, bytemuck::bytes_of(&input.step));
+        inputs.add(&scene.bins.status, step_at, bytemuck::bytes_of(&input.step));
+        if let Some(depth) = depth {
+            let scale = (f64::from(input.depth_weight) * depth.scale) as f32;
+            inputs.add(&self.depth, 0, bytemuck::bytes_of(&DepthStep { scale }));
+        }
+        let mut copies = inputs.send(&self.gpu);
         let bytes = u64::from(frame.width) * u64::from(frame.height) * 4;
-        let mut copies = vec![frame.copy_photo(&photo.rgba)];
+        copies.push(frame.copy_photo(&photo.rgba));
         if let Some(weights) = &photo.weights {
-            copies.push(Op::Copy(weights.clone(), frame.loss.weights.clone(), 0, bytes));
+            copies.push(Op::copy(weights, &frame.loss.weights, 0, bytes));
         }
         if let (Some(depth), Some(buffers)) = (depth, &frame.depth) {
-            let scale = (f64::from(input.depth_weight) * depth.scale) as f32;
-            let uniform = DepthStep { scale };
-            gpu.write(&self.depth, 0, bytemuck::bytes_of(&uniform));
-            copies.push(Op::Copy(depth.rows.clone(), buffers.photo.clone(), 0, 2 * bytes));
+            copies.push(Op::copy(&depth.rows, &buffers.photo, 0, 2 * bytes));
         }
         let mut sums = Vec::new();
         if let (Some(_), Some(buffers)) = (input.exposure, &frame.exposure) {
@@ -220,7 +262,7 @@ impl GpuFit {
                     self.pending_exposures.insert(log)
                 }
             };
-            sums.push(Op::Copy(buffers.sums.clone(), log.clone(), at as u64 * bytes, bytes));
+            sums.push(Op::copy(&buffers.sums, log, at as u64 * bytes, bytes));
         }
         if input.camera_gradient {
             let bytes = scene.camera_bytes();
@@ -231,13 +273,9 @@ impl GpuFit {
                     scene.pending_cameras.insert(log)
                 }
             };
-            let (from, to) = (scene.v_camera.clone(), log.clone());
-            sums.push(Op::Copy(from, to, at as u64 * bytes, bytes));
+            sums.push(Op::copy(&scene.v_camera, log, at as u64 * bytes, bytes));
         }
         self.last = Some((input.view, input.ssim_weight, depth.is_some()));
-        if again {
-            self.set_overflow(0)?;
-        }
         let frame = &self.frames[self.photos[input.view].frame];
         let lists: [&[Op]; 3] = [&copies, &frame.ops, &sums];
         match &mut self.times {
@@ -296,7 +334,7 @@ impl GpuFit {
     fn status(&self) -> Result<(StatusHead, Vec<ChunkCount>)> {
         let scene = self.scene()?;
         let bytes = SplatBins::status_bytes(scene.chunks);
-        let copy = Op::Copy(scene.bins.status.clone(), scene.status_copy.clone(), 0, bytes);
+        let copy = Op::copy(&scene.bins.status, &scene.status_copy, 0, bytes);
         self.gpu.submit(&[&[copy]])?;
         let data = self.gpu.read(&[(&scene.status_copy, bytes)])?;
         let (head, counts) = data[0].split_at(size_of::<StatusHead>());
@@ -331,7 +369,7 @@ impl GpuFit {
         for (at, (input, waiting)) in pending.iter().enumerate().skip(first) {
             loop {
                 if let Err(error) = self.enqueue(input, at, *waiting, true) {
-                    // It has cleared the flag, and the step was not done.
+                    // It may have cleared the flag, and the step was not done.
                     self.set_overflow(input.step)?;
                     return Err(error);
                 }
@@ -347,10 +385,9 @@ impl GpuFit {
         Ok(())
     }
 
-    /// Sets or clears the first step whose pairs did not fit, from the next submission on.
+    /// Sets the first step whose pairs did not fit, from the next submission on.
     fn set_overflow(&self, step: u32) -> Result<()> {
-        let at = std::mem::offset_of!(StatusHead, overflow) as u64;
-        self.gpu.write(&self.scene()?.bins.status, at, bytemuck::bytes_of(&step));
+        self.gpu.write(&self.scene()?.bins.status, OVERFLOW_AT, bytemuck::bytes_of(&step));
         Ok(())
     }
 

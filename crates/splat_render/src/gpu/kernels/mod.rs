@@ -24,7 +24,9 @@ pub(super) enum Access {
 /// Build parameters of the shaders for one kind of adapter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Build {
-    /// Pixel rows per thread of the rasterize kernels; many on software adapters, which read slowly.
+    /// Whether the rasterize kernels draw blocks of pixels, one thread a pixel.
+    pub blocks: bool,
+    /// Pixel rows per thread of rasterize kernels without blocks; software adapters read slowly.
     pub rows: u32,
     /// Whether a tile's threads are one subgroup and share data through it.
     pub subgroups: bool,
@@ -38,9 +40,30 @@ pub(super) struct Build {
 impl Build {
     /// For GPUs, and for software adapters with and without subgroups of a tile's threads.
     pub const ALL: [Self; 3] = [
-        Self { rows: 2, subgroups: false, digit_bits: 8, loss_by_lines: false, segments: 256 },
-        Self { rows: 8, subgroups: true, digit_bits: 4, loss_by_lines: true, segments: 16 },
-        Self { rows: 8, subgroups: false, digit_bits: 4, loss_by_lines: true, segments: 16 },
+        Self {
+            blocks: true,
+            rows: 8,
+            subgroups: false,
+            digit_bits: 8,
+            loss_by_lines: false,
+            segments: 256,
+        },
+        Self {
+            blocks: false,
+            rows: 8,
+            subgroups: true,
+            digit_bits: 4,
+            loss_by_lines: true,
+            segments: 16,
+        },
+        Self {
+            blocks: false,
+            rows: 8,
+            subgroups: false,
+            digit_bits: 4,
+            loss_by_lines: true,
+            segments: 16,
+        },
     ];
 
     pub const fn threads(self) -> u32 {
@@ -57,6 +80,8 @@ pub(super) struct Source {
     parts: &'static [&'static str],
     /// Text for cooperating threads of a tile: for any device, and for tiles that are subgroups.
     tile_work: Option<[&'static str; 2]>,
+    /// Texts in place of both for builds that draw blocks.
+    blocks: Option<&'static [&'static str]>,
     /// Whether the source has the override `SEGMENTS`.
     segmented: bool,
 }
@@ -91,9 +116,9 @@ pub fn shader_variants() -> impl Iterator<Item = ShaderVariant> {
     Build::ALL.into_iter().flat_map(|build| {
         sources().map(move |source| ShaderVariant {
             name: format!(
-                "{}, {} rows{}",
+                "{}, {}{}",
                 source.name,
-                build.rows,
+                if build.blocks { "blocks" } else { "rows" },
                 if build.subgroups { ", subgroups" } else { "" }
             ),
             text: source.text(build),
@@ -122,11 +147,15 @@ impl Source {
         parts: &'static [&'static str],
         bindings: &'static [Access],
     ) -> Self {
-        Self { name, bindings, parts, tile_work: None, segmented: false }
+        Self { name, bindings, parts, tile_work: None, blocks: None, segmented: false }
     }
 
     const fn with_tile_work(self, texts: [&'static str; 2]) -> Self {
         Self { tile_work: Some(texts), ..self }
+    }
+
+    const fn with_blocks(self, parts: &'static [&'static str]) -> Self {
+        Self { blocks: Some(parts), ..self }
     }
 
     const fn segmented(self) -> Self {
@@ -135,11 +164,12 @@ impl Source {
 
     pub fn text(&self, build: Build) -> String {
         let mut text = constants(build.rows);
-        if let Some(texts) = self.tile_work {
+        let blocks = self.blocks.filter(|_| build.blocks);
+        if let (Some(texts), None) = (self.tile_work, blocks) {
             text.push_str(texts[usize::from(build.subgroups)]);
         }
         text.push_str(&repeat_rows(SHARED, build.rows));
-        for part in self.parts {
+        for part in blocks.unwrap_or(self.parts) {
             text.push_str(&repeat_rows(part, build.rows));
         }
         text

@@ -102,7 +102,10 @@ const SORT_KEYS: &str = include_str!("../shaders/bin_sort_keys.wgsl");
 const SORT_BINDINGS: [Access; 7] =
     [Uniform, ReadWrite, Read, Read, ReadWrite, ReadWrite, ReadWrite];
 const BIN_TILES: &str = include_str!("../shaders/bin_tiles.wgsl");
+const TILE_BLOCKS: &str = include_str!("../shaders/tile_blocks.wgsl");
 const BACKWARD: &str = include_str!("../shaders/rasterize_backward.wgsl");
+const BACKWARD_BLOCKS: &str = include_str!("../shaders/rasterize_backward_blocks.wgsl");
+const BACKWARD_PIXELS: &str = include_str!("../shaders/backward_pixels.wgsl");
 const BACKWARD_BINDINGS: [Access; 10] =
     [Uniform, Uniform, Read, Read, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite];
 const BACKWARD_SUM: &str = include_str!("../shaders/rasterize_backward_sum.wgsl");
@@ -267,15 +270,21 @@ static RASTERIZE: Source = Source::new(
     &[include_str!("../shaders/rasterize.wgsl")],
     &[Uniform, Uniform, Read, Read, Read, ReadWrite, ReadWrite],
 )
-.with_tile_work(TILE_WORK);
+.with_tile_work(TILE_WORK)
+.with_blocks(&[BIN_TILES, TILE_BLOCKS, include_str!("../shaders/rasterize_blocks.wgsl")]);
 
 static RASTERIZE_BACKWARD: Source =
-    Source::new("rasterize_backward", &[SIGNED, BACKWARD], &BACKWARD_BINDINGS)
-        .with_tile_work(TILE_SUMS);
+    Source::new("rasterize_backward", &[SIGNED, BACKWARD_PIXELS, BACKWARD], &BACKWARD_BINDINGS)
+        .with_tile_work(TILE_SUMS)
+        .with_blocks(&[SIGNED, BACKWARD_PIXELS, BIN_TILES, TILE_BLOCKS, BACKWARD_BLOCKS]);
 
-static RASTERIZE_BACKWARD_ABSOLUTE: Source =
-    Source::new("rasterize_backward_absolute", &[ABSOLUTE, BACKWARD], &BACKWARD_BINDINGS)
-        .with_tile_work(TILE_SUMS);
+static RASTERIZE_BACKWARD_ABSOLUTE: Source = Source::new(
+    "rasterize_backward_absolute",
+    &[ABSOLUTE, BACKWARD_PIXELS, BACKWARD],
+    &BACKWARD_BINDINGS,
+)
+.with_tile_work(TILE_SUMS)
+.with_blocks(&[ABSOLUTE, BACKWARD_PIXELS, BIN_TILES, TILE_BLOCKS, BACKWARD_BLOCKS]);
 
 static RASTERIZE_BACKWARD_SUM: Source =
     Source::new("rasterize_backward_sum", &[SIGNED, BACKWARD_SUM], &BACKWARD_SUM_BINDINGS);

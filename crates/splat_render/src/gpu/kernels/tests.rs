@@ -61,6 +61,32 @@ fn bindings_are_declared_as_bound() {
     }
 }
 
+/// The kernels are compiled without naga's bounds on loops.
+#[test]
+fn loops_count_to_an_end() {
+    let mut loops = 0;
+    for (source, build) in sources().flat_map(|source| Build::ALL.map(|build| (source, build))) {
+        for line in source.text(build).lines() {
+            let line = line.split("//").next().unwrap_or_default().trim();
+            let words = line.split(|c: char| !c.is_alphanumeric() && c != '_');
+            assert!(
+                !words.clone().any(|w| ["while", "loop"].contains(&w)),
+                "{}: {line}",
+                source.name
+            );
+            if words.clone().any(|word| word == "for") {
+                let parts: Vec<_> = line.split(';').collect();
+                let [_, condition, step] = parts[..] else { panic!("{}: {line}", source.name) };
+                let compares = ["<", "!="].iter().any(|sign| condition.contains(sign));
+                let counts = ["++", "+= ", "*= ", "&= "].iter().any(|sign| step.contains(sign));
+                assert!(compares && counts, "{}: {line}", source.name);
+                loops += 1;
+            }
+        }
+    }
+    assert!(loops > 100, "{loops}");
+}
+
 /// Asserts a struct's members and size against naga's layout of the WGSL struct.
 fn assert_layout(kernel: Kernel, name: &str, size: usize, members: &[(&str, usize)]) {
     let module = parse(kernel.source());
@@ -103,7 +129,7 @@ fn rust_and_wgsl_agree_on_layouts() {
         DepthKeys, Chunk as "Chunk":
             tile_begin tile_end capacity splats index is_first is_last list_begin list_end groups_max;
         ScanSums, ChunkCount as "ChunkCount": pairs total;
-        SortCount, SortPass as "SortPass": shift chunk is_first keeps_culled;
+        SortCount, SortPass as "SortPass": shift chunk is_first keeps_culled sums;
         DepthLoss, DepthStep as "DepthStep": scale;
         Exposure, ExposureUniform as "Exposure": gain offset behind background;
         AdamColors, Step as "Step":

@@ -1,18 +1,21 @@
 // bin_sort: one pass of a stable radix sort by eight bits, in two dispatches over contiguous segments.
-// The first counts digits; the second sums the counts of earlier segments and scatters 256 keys at a
+// The first counts digits; the second adds up the counts of earlier segments and scatters 256 keys at a
 // time: a thread's place within its digit is the number of lower bits in the digit's mask. No workgroup
 // waits for another, and the result depends only on the keys. Follows shared.wgsl and bin_sort_keys.wgsl.
 
 @group(0) @binding(2) var<storage, read> keys_in: array<u32>;
 @group(0) @binding(3) var<storage, read> values_in: array<u32>;
-// [segment][digit]
-@group(0) @binding(4) var<storage, read_write> histogram: array<u32>;
+// Rows of a count for each digit: SEGMENTS of segments, then 3 times SUM_ROWS of sums, of 8 and of 64
+// segments. A pass uses one of the three and clears the rest.
+@group(0) @binding(4) var<storage, read_write> histogram: array<atomic<u32>>;
 @group(0) @binding(5) var<storage, read_write> keys_out: array<u32>;
 @group(0) @binding(6) var<storage, read_write> values_out: array<u32>;
 
 override SEGMENTS: u32 = 64u;
 const THREADS = 256u; // one for each digit
 const WORDS = 8u; // THREADS / 32
+const EIGHTS = 32u; // of 256 segments
+const SUM_ROWS = 36u; // EIGHTS and four of 64 segments
 
 // [digit][word]: which threads have the digit.
 var<workgroup> masks: array<atomic<u32>, 2048>;
@@ -24,6 +27,10 @@ fn segment_range(count: u32, segment: u32) -> vec2<u32> {
     let blocks = (count + THREADS - 1u) / THREADS;
     let size = (blocks + SEGMENTS - 1u) / SEGMENTS * THREADS;
     return vec2(min(segment * size, count), min((segment + 1u) * size, count));
+}
+
+fn row(at: u32, digit: u32) -> u32 {
+    return atomicLoad(&histogram[at * THREADS + digit]);
 }
 
 fn digit(key: u32) -> u32 {
@@ -45,7 +52,17 @@ fn sort_count(
         }
     }
     workgroupBarrier();
-    histogram[workgroup.x * THREADS + local] = atomicLoad(&counts[local]);
+    let count = atomicLoad(&counts[local]);
+    atomicStore(&histogram[workgroup.x * THREADS + local], count);
+    let sums = SEGMENTS + pass_.sums * SUM_ROWS;
+    if count > 0u {
+        atomicAdd(&histogram[(sums + workgroup.x / 8u) * THREADS + local], count);
+        atomicAdd(&histogram[(sums + EIGHTS + workgroup.x / 64u) * THREADS + local], count);
+    }
+    let other = SEGMENTS + workgroup.x;
+    if workgroup.x < 3u * SUM_ROWS && (other < sums || other >= sums + SUM_ROWS) {
+        atomicStore(&histogram[other * THREADS + local], 0u);
+    }
 }
 
 @compute @workgroup_size(THREADS)
@@ -56,10 +73,17 @@ fn sort_place(
     let range = segment_range(same_for_all(local), workgroup.x);
     var before = 0u;
     var total = 0u;
-    for (var segment = 0u; segment < SEGMENTS; segment++) {
-        let count = histogram[segment * THREADS + local];
-        before += select(0u, count, segment < workgroup.x);
+    let eights = SEGMENTS + pass_.sums * SUM_ROWS;
+    for (var many = 0u; many < SUM_ROWS - EIGHTS; many++) {
+        let count = row(eights + EIGHTS + many, local);
+        before += select(0u, count, many < workgroup.x / 64u);
         total += count;
+    }
+    for (var eight = workgroup.x / 64u * 8u; eight < workgroup.x / 8u; eight++) {
+        before += row(eights + eight, local);
+    }
+    for (var segment = workgroup.x / 8u * 8u; segment < workgroup.x; segment++) {
+        before += row(segment, local);
     }
     bases[local] = total;
     for (var word = 0u; word < WORDS; word++) {

@@ -1,4 +1,4 @@
-// Which tiles a 2D splat touches, exactly up to a safety margin. Culling only leaves out pairs
+// Which pixels and tiles a 2D splat touches, exactly up to a safety margin. Culling only leaves out pairs
 // that contribute nothing, so the margin costs time but never changes the picture.
 
 struct Footprint {
@@ -44,10 +44,9 @@ fn footprint(splat: Splat2d) -> Footprint {
     return f;
 }
 
-// First and one-past-last tile column of a row of tiles; empty if begin >= end.
-fn columns(f: Footprint, row: u32) -> vec2<u32> {
-    let band_begin = row * TILE;
-    let band_end = min(band_begin + TILE, view.height);
+// First and one-past-last pixel of the splat in rows band_begin to band_end - 1 of the picture; equal if
+// there is none.
+fn pixels(f: Footprint, band_begin: u32, band_end: u32) -> vec2<u32> {
     let slack = 0.01 + 1e-5 * abs(f.center.y);
     let w_low = f.r * (f32(band_begin) + 0.5 - slack - f.center.y);
     let w_high = f.r * (f32(band_end) - 0.5 + slack - f.center.y);
@@ -70,10 +69,13 @@ fn columns(f: Footprint, row: u32) -> vec2<u32> {
     if last < 0.0 || first > last_pixel || last < first {
         return vec2(0u);
     }
-    return vec2(
-        u32(clamp(first, 0.0, last_pixel)) / TILE,
-        u32(clamp(last, 0.0, last_pixel)) / TILE + 1u,
-    );
+    return vec2(u32(clamp(first, 0.0, last_pixel)), u32(clamp(last, 0.0, last_pixel)) + 1u);
+}
+
+// First and one-past-last tile column of a row of tiles; empty if begin >= end.
+fn columns(f: Footprint, row: u32) -> vec2<u32> {
+    let span = pixels(f, row * TILE, min(row * TILE + TILE, view.height));
+    return vec2(span.x / TILE, (span.y + TILE - 1u) / TILE);
 }
 
 // `columns` cut to the chunk's tiles.

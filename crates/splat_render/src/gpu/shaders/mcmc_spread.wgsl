@@ -65,7 +65,7 @@ fn mcmc_draw(
     // The first whose sum is above.
     var begin = 0u;
     var end = run.splats;
-    while begin < end {
+    for (var halving = 0u; halving < 32u && begin < end; halving++) {
         let middle = (begin + end) / 2u;
         if weight_sums[middle] <= at {
             begin = middle + 1u;

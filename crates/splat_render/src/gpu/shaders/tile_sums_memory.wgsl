@@ -16,6 +16,10 @@ fn keep_sum(b: u32, entry: u32, sum: f32, thread: u32) {
 
 // Writes the sums of a batch to its slots; whether any thread is live.
 fn write_sums(batch: u32, count: u32, live: bool, thread: u32) -> bool {
+    if thread == 0u {
+        any_live = 0u;
+    }
+    workgroupBarrier();
     if live {
         any_live = 1u;
     }
@@ -27,8 +31,6 @@ fn write_sums(batch: u32, count: u32, live: bool, thread: u32) -> bool {
         }
         slots[slot_from_pair[batch + entry / SUMS] * SUMS + entry % SUMS] = sum;
     }
-    workgroupBarrier();
-    any_live = 0u;
     workgroupBarrier();
     return goes_on == 1u;
 }
