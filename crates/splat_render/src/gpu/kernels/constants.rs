@@ -81,14 +81,5 @@ pub(super) fn constants(rows: u32) -> String {
     for (i, tap) in SSIM_WINDOW.iter().take(SSIM_WINDOW.len() / 2 + 1).enumerate() {
         let _ = writeln!(out, "const SSIM_TAP_{i} = {tap:e}f;");
     }
-    // Weights of each of the 14 values that four neighboring outputs of SSIM's filter need.
-    let tap = |k: usize, output: usize| {
-        let weight = k.checked_sub(output).and_then(|k| SSIM_WINDOW.get(k)).unwrap_or(&0.0);
-        format!("{weight:e}f")
-    };
-    let rows: Vec<String> = (0..SSIM_WINDOW.len() + 3)
-        .map(|k| format!("vec4({})", [0, 1, 2, 3].map(|output| tap(k, output)).join(", ")))
-        .collect();
-    let _ = writeln!(out, "const SSIM_FOUR = array({});", rows.join(", "));
     out
 }

@@ -43,6 +43,15 @@ fn sort_count(
     @builtin(local_invocation_index) local: u32,
 ) {
     let range = segment_range(same_for_all(local), workgroup.x);
+    let sums = SEGMENTS + pass_.sums * SUM_ROWS;
+    let other = SEGMENTS + workgroup.x;
+    if workgroup.x < 3u * SUM_ROWS && (other < sums || other >= sums + SUM_ROWS) {
+        atomicStore(&histogram[other * THREADS + local], 0u);
+    }
+    // Segments without keys are the last, and no segment reads them.
+    if range.x >= range.y {
+        return;
+    }
     atomicStore(&counts[local], 0u);
     workgroupBarrier();
     for (var i = range.x + local; i < range.y; i += THREADS) {
@@ -54,14 +63,9 @@ fn sort_count(
     workgroupBarrier();
     let count = atomicLoad(&counts[local]);
     atomicStore(&histogram[workgroup.x * THREADS + local], count);
-    let sums = SEGMENTS + pass_.sums * SUM_ROWS;
     if count > 0u {
         atomicAdd(&histogram[(sums + workgroup.x / 8u) * THREADS + local], count);
         atomicAdd(&histogram[(sums + EIGHTS + workgroup.x / 64u) * THREADS + local], count);
-    }
-    let other = SEGMENTS + workgroup.x;
-    if workgroup.x < 3u * SUM_ROWS && (other < sums || other >= sums + SUM_ROWS) {
-        atomicStore(&histogram[other * THREADS + local], 0u);
     }
 }
 
@@ -71,6 +75,10 @@ fn sort_place(
     @builtin(local_invocation_index) local: u32,
 ) {
     let range = segment_range(same_for_all(local), workgroup.x);
+    // The first notes the number of keys, be it 0.
+    if workgroup.x > 0u && range.x >= range.y {
+        return;
+    }
     var before = 0u;
     var total = 0u;
     let eights = SEGMENTS + pass_.sums * SUM_ROWS;

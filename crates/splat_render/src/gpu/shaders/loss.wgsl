@@ -1,38 +1,78 @@
 // loss: L1 and D-SSIM of the picture against a photo, with the picture's gradient. Two passes of a
-// separable filter: to the slopes of SSIM by the filtered maps, then back. A thread filters four
-// neighbors at once. The first pass writes derivatives of the weighted SSIM sum by the filtered x, xx and
-// xy: nine planes, by channel first. Follows loss_pixels.wgsl.
+// separable filter: to the slopes of SSIM by the filtered maps, then back. A thread has one pixel of a
+// tile; a tile and its margin are read once, then filtered along rows and columns. The first pass writes
+// derivatives of the weighted SSIM sum by the filtered x, xx and xy: nine planes, by channel first. Follows
+// loss_pixels.wgsl.
 
-const THREADS = 64u;
+const THREADS = TILE * TILE;
 // Taps on each side of the window's center.
 const HALF = 5;
-// Values that four neighboring outputs need.
-const SPAN = 14u;
-// Rows of a tile with the window's margin.
-const ROWS_FILTERED = 26u;
-const STRIP = 416u; // ROWS_FILTERED * TILE
+// Side of a tile with the window's margin.
+const SIDE = 26u;
+const STAGED = SIDE * SIDE;
+// Pixels filtered along rows.
+const ROW_FILTERED = SIDE * TILE;
 
-// Maps filtered along rows.
-var<workgroup> filtered: array<f32, 2080>; // 5 STRIP
+// Picture and photo.
+var<workgroup> staged: array<vec2<f32>, STAGED>;
+// x, y, x^2 + y^2 and x y.
+var<workgroup> filtered: array<vec4<f32>, ROW_FILTERED>;
+// Three planes of slopes.
+var<workgroup> staged_slopes: array<f32, 3u * STAGED>;
+var<workgroup> filtered_slopes: array<f32, 3u * ROW_FILTERED>;
 var<workgroup> partial_sums: array<f32, THREADS>;
 
-fn exists(x: i32, y: i32) -> bool {
-    return x >= 0 && y >= 0 && x < i32(view.width) && y < i32(view.height);
+// The pixel of a staged one, or UINT_MAX outside of the picture, which counts as zero.
+fn staged_pixel(workgroup: vec3<u32>, k: u32) -> u32 {
+    let at = vec2<i32>(workgroup.xy * TILE + vec2(k % SIDE, k / SIDE)) - HALF;
+    if any(at < vec2(0)) || at.x >= i32(view.width) || at.y >= i32(view.height) {
+        return 0xffffffffu;
+    }
+    return u32(at.y) * view.width + u32(at.x);
 }
 
-// Four rows of a filtered map at a column, filtered along the column.
-fn column(map: u32, x: u32, y: u32) -> vec4<f32> {
-    var sum = vec4(0.0);
-    for (var k = 0u; k < SPAN; k++) {
-        sum += SSIM_FOUR[k] * filtered[map * STRIP + (y + k) * TILE + x];
-    }
-    return sum;
+fn pick(color: vec3<f32>, channel: u32) -> f32 {
+    return select(select(color.z, color.y, channel == 1u), color.x, channel == 0u);
 }
 
-fn store(map: u32, at: u32, values: vec4<f32>) {
-    for (var k = 0u; k < 4u; k++) {
-        filtered[map * STRIP + at + k] = values[k];
-    }
+fn maps(at: u32) -> vec4<f32> {
+    let v = staged[at];
+    return vec4(v, dot(v, v), v.x * v.y);
+}
+
+// Along the row that begins at staged pixel `at`.
+fn row_of_maps(at: u32) -> vec4<f32> {
+    return SSIM_TAP_0 * (maps(at) + maps(at + 10u)) + SSIM_TAP_1 * (maps(at + 1u) + maps(at + 9u))
+        + SSIM_TAP_2 * (maps(at + 2u) + maps(at + 8u)) + SSIM_TAP_3 * (maps(at + 3u) + maps(at + 7u))
+        + SSIM_TAP_4 * (maps(at + 4u) + maps(at + 6u)) + SSIM_TAP_5 * maps(at + 5u);
+}
+
+// Down the column that begins at `at`.
+fn column_of_maps(at: u32) -> vec4<f32> {
+    return SSIM_TAP_0 * (filtered[at] + filtered[at + 10u * TILE])
+        + SSIM_TAP_1 * (filtered[at + TILE] + filtered[at + 9u * TILE])
+        + SSIM_TAP_2 * (filtered[at + 2u * TILE] + filtered[at + 8u * TILE])
+        + SSIM_TAP_3 * (filtered[at + 3u * TILE] + filtered[at + 7u * TILE])
+        + SSIM_TAP_4 * (filtered[at + 4u * TILE] + filtered[at + 6u * TILE])
+        + SSIM_TAP_5 * filtered[at + 5u * TILE];
+}
+
+fn row_of_slopes(at: u32) -> f32 {
+    return SSIM_TAP_0 * (staged_slopes[at] + staged_slopes[at + 10u])
+        + SSIM_TAP_1 * (staged_slopes[at + 1u] + staged_slopes[at + 9u])
+        + SSIM_TAP_2 * (staged_slopes[at + 2u] + staged_slopes[at + 8u])
+        + SSIM_TAP_3 * (staged_slopes[at + 3u] + staged_slopes[at + 7u])
+        + SSIM_TAP_4 * (staged_slopes[at + 4u] + staged_slopes[at + 6u])
+        + SSIM_TAP_5 * staged_slopes[at + 5u];
+}
+
+fn column_of_slopes(at: u32) -> f32 {
+    return SSIM_TAP_0 * (filtered_slopes[at] + filtered_slopes[at + 10u * TILE])
+        + SSIM_TAP_1 * (filtered_slopes[at + TILE] + filtered_slopes[at + 9u * TILE])
+        + SSIM_TAP_2 * (filtered_slopes[at + 2u * TILE] + filtered_slopes[at + 8u * TILE])
+        + SSIM_TAP_3 * (filtered_slopes[at + 3u * TILE] + filtered_slopes[at + 7u * TILE])
+        + SSIM_TAP_4 * (filtered_slopes[at + 4u * TILE] + filtered_slopes[at + 6u * TILE])
+        + SSIM_TAP_5 * filtered_slopes[at + 5u * TILE];
 }
 
 // Sum over the workgroup in a fixed order; valid in thread 0.
@@ -40,12 +80,21 @@ fn workgroup_sum(local: u32, value: f32) -> f32 {
     partial_sums[local] = value;
     workgroupBarrier();
     var sum = 0.0;
-    if local == 0u {
-        for (var k = 0u; k < THREADS; k++) {
-            sum += partial_sums[k];
+    if local < TILE {
+        for (var k = 0u; k < TILE; k++) {
+            sum += partial_sums[k * TILE + local];
         }
     }
-    return sum;
+    workgroupBarrier();
+    partial_sums[local] = sum;
+    workgroupBarrier();
+    var total = 0.0;
+    if local == 0u {
+        for (var k = 0u; k < TILE; k++) {
+            total += partial_sums[k];
+        }
+    }
+    return total;
 }
 
 @compute @workgroup_size(THREADS)
@@ -55,49 +104,37 @@ fn loss_slopes(
     @builtin(local_invocation_index) local: u32,
 ) {
     let pixels = view.width * view.height;
-    let corner = vec2<i32>(workgroup.xy * TILE);
-    let in_tile = vec2(local % TILE, local / TILE * 4u);
+    let at = workgroup.xy * TILE + vec2(local % TILE, local / TILE);
+    let exists = at.x < view.width && at.y < view.height;
+    let pixel = at.y * view.width + at.x;
+    var w = 0.0;
+    if exists {
+        w = weight(pixel);
+    }
     var ssim_sum = 0.0;
     for (var channel = 0u; channel < 3u; channel++) {
-        for (var task = local; task < ROWS_FILTERED * 4u; task += THREADS) {
-            let x = corner.x + i32(task % 4u) * 4 - HALF;
-            let y = corner.y + i32(task / 4u) - HALF;
-            var mu_x = vec4(0.0);
-            var mu_y = vec4(0.0);
-            var xx = vec4(0.0);
-            var yy = vec4(0.0);
-            var xy = vec4(0.0);
-            for (var k = 0u; k < SPAN; k++) {
-                // Outside counts as zero.
-                if exists(x + i32(k), y) {
-                    let pixel = u32(y) * view.width + u32(x + i32(k));
-                    let a = picture[pixel][channel];
-                    let b = photo_color(pixel)[channel];
-                    let tap = SSIM_FOUR[k];
-                    mu_x += tap * a;
-                    mu_y += tap * b;
-                    xx += tap * (a * a);
-                    yy += tap * (b * b);
-                    xy += tap * (a * b);
-                }
+        for (var k = local; k < STAGED; k += THREADS) {
+            let from_pixel = staged_pixel(workgroup, k);
+            var both = vec2(0.0);
+            if from_pixel != 0xffffffffu {
+                both.x = pick(picture[from_pixel].xyz, channel);
+                both.y = pick(photo_color(from_pixel), channel);
             }
-            store(0u, task * 4u, mu_x);
-            store(1u, task * 4u, mu_y);
-            store(2u, task * 4u, xx);
-            store(3u, task * 4u, yy);
-            store(4u, task * 4u, xy);
+            staged[k] = both;
         }
         workgroupBarrier();
-        let mu_x = column(0u, in_tile.x, in_tile.y);
-        let mu_y = column(1u, in_tile.x, in_tile.y);
-        let xx = column(2u, in_tile.x, in_tile.y);
-        let yy = column(3u, in_tile.x, in_tile.y);
-        let xy = column(4u, in_tile.x, in_tile.y);
+        for (var k = local; k < ROW_FILTERED; k += THREADS) {
+            filtered[k] = row_of_maps(k / TILE * SIDE + k % TILE);
+        }
+        workgroupBarrier();
+        let m = column_of_maps(local);
+        let mu_x = m.x;
+        let mu_y = m.y;
         let squares = mu_x * mu_x + mu_y * mu_y;
         let a1 = 2.0 * mu_x * mu_y + SSIM_C1;
-        let a2 = 2.0 * (xy - mu_x * mu_y) + SSIM_C2;
+        let a2 = 2.0 * (m.w - mu_x * mu_y) + SSIM_C2;
         let b1 = squares + SSIM_C1;
-        let b2 = xx + yy - squares + SSIM_C2;
+        let b2 = m.z - squares + SSIM_C2;
         let inverse = 1.0 / (b1 * b2);
         let ssim = a1 * a2 * inverse;
         let v_xx = -ssim * inverse * b1;
@@ -105,19 +142,12 @@ fn loss_slopes(
         // Directly, and through s_xx = xx - mu_x^2 and s_xy = xy - mu_x mu_y.
         let direct = mu_y * a2 * inverse - mu_x * ssim * inverse * b2;
         let v_mu = 2.0 * direct - (2.0 * v_xx * mu_x + v_xy * mu_y);
-        for (var k = 0u; k < 4u; k++) {
-            let x = u32(corner.x) + in_tile.x;
-            let y = u32(corner.y) + in_tile.y + k;
-            if x < view.width && y < view.height {
-                let pixel = y * view.width + x;
-                let w = weight(pixel);
-                slopes[(3u * channel) * pixels + pixel] = w * v_mu[k];
-                slopes[(3u * channel + 1u) * pixels + pixel] = w * v_xx[k];
-                slopes[(3u * channel + 2u) * pixels + pixel] = w * v_xy[k];
-                ssim_sum += w * ssim[k];
-            }
+        if exists {
+            slopes[(3u * channel) * pixels + pixel] = w * v_mu;
+            slopes[(3u * channel + 1u) * pixels + pixel] = w * v_xx;
+            slopes[(3u * channel + 2u) * pixels + pixel] = w * v_xy;
+            ssim_sum += w * ssim;
         }
-        workgroupBarrier();
     }
     let sum = workgroup_sum(local, ssim_sum);
     if local == 0u {
@@ -132,58 +162,53 @@ fn loss_gradient(
     @builtin(local_invocation_index) local: u32,
 ) {
     let pixels = view.width * view.height;
-    let corner = vec2<i32>(workgroup.xy * TILE);
-    let in_tile = vec2(local % TILE, local / TILE * 4u);
-    // Per channel: gradient through SSIM of the filtered maps, four rows each.
-    var v_mu: array<vec4<f32>, 3>;
-    var v_xx: array<vec4<f32>, 3>;
-    var v_xy: array<vec4<f32>, 3>;
+    let at = workgroup.xy * TILE + vec2(local % TILE, local / TILE);
+    let exists = at.x < view.width && at.y < view.height;
+    let pixel = at.y * view.width + at.x;
+    var color = vec3(0.0);
+    var wanted = vec3(0.0);
+    if exists {
+        color = picture[pixel].xyz;
+        wanted = photo_color(pixel);
+    }
+    // Through SSIM of the filtered maps.
+    var v_ssim = vec3(0.0);
     for (var channel = 0u; channel < 3u; channel++) {
-        for (var task = local; task < ROWS_FILTERED * 4u; task += THREADS) {
-            let x = corner.x + i32(task % 4u) * 4 - HALF;
-            let y = corner.y + i32(task / 4u) - HALF;
-            var mu = vec4(0.0);
-            var xx = vec4(0.0);
-            var xy = vec4(0.0);
-            for (var k = 0u; k < SPAN; k++) {
-                if exists(x + i32(k), y) {
-                    let at = (3u * channel) * pixels + u32(y) * view.width + u32(x + i32(k));
-                    let tap = SSIM_FOUR[k];
-                    mu += tap * slopes[at];
-                    xx += tap * slopes[at + pixels];
-                    xy += tap * slopes[at + 2u * pixels];
-                }
+        for (var k = local; k < STAGED; k += THREADS) {
+            let from_pixel = staged_pixel(workgroup, k);
+            var planes = vec3(0.0);
+            if from_pixel != 0xffffffffu {
+                let slope = 3u * channel * pixels + from_pixel;
+                planes = vec3(slopes[slope], slopes[slope + pixels], slopes[slope + 2u * pixels]);
             }
-            store(0u, task * 4u, mu);
-            store(1u, task * 4u, xx);
-            store(2u, task * 4u, xy);
+            staged_slopes[k] = planes.x;
+            staged_slopes[STAGED + k] = planes.y;
+            staged_slopes[2u * STAGED + k] = planes.z;
         }
         workgroupBarrier();
-        v_mu[channel] = column(0u, in_tile.x, in_tile.y);
-        v_xx[channel] = column(1u, in_tile.x, in_tile.y);
-        v_xy[channel] = column(2u, in_tile.x, in_tile.y);
-        workgroupBarrier();
-    }
-    var l1_sum = 0.0;
-    for (var k = 0u; k < 4u; k++) {
-        let x = u32(corner.x) + in_tile.x;
-        let y = u32(corner.y) + in_tile.y + k;
-        if x < view.width && y < view.height {
-            let pixel = y * view.width + x;
-            let w = weight(pixel);
-            let color = picture[pixel].xyz;
-            let wanted = photo_color(pixel);
-            let off = color - wanted;
-            let v_ssim = vec3(v_mu[0][k], v_mu[1][k], v_mu[2][k])
-                + 2.0 * color * vec3(v_xx[0][k], v_xx[1][k], v_xx[2][k])
-                + wanted * vec3(v_xy[0][k], v_xy[1][k], v_xy[2][k]);
-            let v_color = step.l1 * w * sign(off) - step.ssim * v_ssim;
-            v_picture[pixel] = vec4(v_color, 0.0);
-            totals[pixel] = dot(color, v_color);
-            l1_sum += w * (abs(off.x) + abs(off.y) + abs(off.z));
+        for (var k = local; k < ROW_FILTERED; k += THREADS) {
+            let row = k / TILE * SIDE + k % TILE;
+            filtered_slopes[k] = row_of_slopes(row);
+            filtered_slopes[ROW_FILTERED + k] = row_of_slopes(STAGED + row);
+            filtered_slopes[2u * ROW_FILTERED + k] = row_of_slopes(2u * STAGED + row);
         }
+        workgroupBarrier();
+        let v_mu = column_of_slopes(local);
+        let v_xx = column_of_slopes(ROW_FILTERED + local);
+        let v_xy = column_of_slopes(2u * ROW_FILTERED + local);
+        let v = v_mu + 2.0 * pick(color, channel) * v_xx + pick(wanted, channel) * v_xy;
+        v_ssim = select(v_ssim, vec3(v), vec3(channel) == vec3(0u, 1u, 2u));
     }
-    let sum = workgroup_sum(local, l1_sum);
+    var l1 = 0.0;
+    if exists {
+        let w = weight(pixel);
+        let off = color - wanted;
+        let v_color = step.l1 * w * sign(off) - step.ssim * v_ssim;
+        v_picture[pixel] = vec4(v_color, 0.0);
+        totals[pixel] = dot(color, v_color);
+        l1 = w * (abs(off.x) + abs(off.y) + abs(off.z));
+    }
+    let sum = workgroup_sum(local, l1);
     if local == 0u {
         sums[workgroup.y * groups.x + workgroup.x].y = sum;
     }
