@@ -90,7 +90,10 @@ const GEOMETRY_UPDATED: &str =
 const COLORS_READ: &str = "@group(0) @binding(3) var<storage, read> colors: array<f32>;\n";
 const COLORS_UPDATED: &str = "@group(0) @binding(3) var<storage, read_write> colors: array<f32>;\n";
 const PROJECT_WGSL: &str = include_str!("../shaders/project.wgsl");
-/// Before [`PROJECT_WGSL`] if all colors are up to date.
+const SH_COLOR: &str = include_str!("../shaders/sh_color.wgsl");
+const COLOR_OF: &str = include_str!("../shaders/color_of.wgsl");
+const WAITING_COLORS: &str = include_str!("../shaders/waiting_colors.wgsl");
+/// Before [`COLOR_OF`] if all colors are up to date.
 const NONE_WAIT: &str = "fn catch_up(i: u32) {}\n";
 const SPLAT_BACKWARD: &str = include_str!("../shaders/splat_backward.wgsl");
 const ADAM_STEP: &str = include_str!("../shaders/adam_step.wgsl");
@@ -131,7 +134,7 @@ const ABSOLUTE: &str = "const SUMS = GRADIENT_ABSOLUTE;\n";
 
 static PROJECT: Source = Source::new(
     "project",
-    &[GEOMETRY_READ, COLORS_READ, GEOMETRY_WGSL, NONE_WAIT, PROJECT_WGSL],
+    &[GEOMETRY_READ, COLORS_READ, GEOMETRY_WGSL, NONE_WAIT, COLOR_OF, SH_COLOR, PROJECT_WGSL],
     &[Uniform, Uniform, Read, Read, ReadWrite, ReadWrite],
 );
 
@@ -142,14 +145,27 @@ static FIT_PROJECT: Source = Source::new(
         COLORS_UPDATED,
         GEOMETRY_WGSL,
         ADAM_STEP,
-        include_str!("../shaders/waiting_colors.wgsl"),
+        WAITING_COLORS,
+        include_str!("../shaders/color_rows.wgsl"),
+        COLOR_OF,
+        SH_COLOR,
         PROJECT_WGSL,
     ],
     &[
         Uniform, Uniform, Read, ReadWrite, ReadWrite, ReadWrite, ReadWrite, ReadWrite, ReadWrite,
         Read, Uniform,
     ],
-);
+)
+.with_blocks(&[
+    GEOMETRY_READ,
+    COLORS_UPDATED,
+    GEOMETRY_WGSL,
+    ADAM_STEP,
+    WAITING_COLORS,
+    include_str!("../shaders/color_groups.wgsl"),
+    SH_COLOR,
+    PROJECT_WGSL,
+]);
 
 static PROJECT_BACKWARD: Source = Source::new(
     "project_backward",

@@ -1,20 +1,11 @@
-// project: splats and camera to 2D splats. Follows geometry.wgsl; in fits also waiting_colors.wgsl.
+// project: splats and camera to 2D splats. Follows sh_color.wgsl; in fits also waiting_colors.wgsl.
 
 // Of culled splats, the radii alone.
 @group(0) @binding(4) var<storage, read_write> splats2d: array<Splat2d>;
 @group(0) @binding(5) var<storage, read_write> keys: array<u32>;
 
-@compute @workgroup_size(64)
-fn project(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) groups: vec3<u32>,
-    @builtin(local_invocation_index) local: u32,
-) {
-    look_up_mode(workgroup);
-    let i = linear_index(workgroup, groups, local, 64u);
-    if i >= window.count {
-        return;
-    }
+// The direction from the camera in place of the color; radii (0, 0) if culled.
+fn without_color(i: u32) -> Splat2d {
     var out: Splat2d;
     let g = load_geometry(i);
     // ALPHA_MIN also stops opacities that are zero, negative or underflown.
@@ -44,33 +35,44 @@ fn project(
             && is_finite(root_det) && is_finite(sxy);
         let in_picture = all(center + radii >= vec2(0.0)) && all(center - radii <= size);
         if finite && in_picture && all(radii > vec2(0.0)) {
-            var color = vec3(0.0);
-            if mode.sh_stride == 0u {
-                color = coefficient(i);
-            } else {
-                catch_up(i);
-                color = sh_color(i, view_direction(g.t).xyz);
-            }
-            // Tested before max(), which may turn NaN into 0.
-            if is_finite3(color) {
-                if mode.sh_stride != 0u {
-                    color = max(color, vec3(0.0));
-                }
-                out.mean = center;
-                out.pq = vec2(p, q);
-                out.color = color;
-                out.r = r;
-                out.depth = g.t.z;
-                out.opacity = opacity;
-                out.radii = radii;
-            }
+            out.mean = center;
+            out.pq = vec2(p, q);
+            out.color = view_direction(g.t).xyz;
+            out.r = r;
+            out.depth = g.t.z;
+            out.opacity = opacity;
+            out.radii = radii;
         }
     }
-    if all(out.radii == vec2(0.0)) {
-        splats2d[i].radii = vec2(0.0);
-        keys[i] = CULLED_KEY;
-    } else {
+    return out;
+}
+
+@compute @workgroup_size(64)
+fn project(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) local: u32,
+) {
+    look_up_mode(workgroup);
+    let i = linear_index(workgroup, groups, local, 64u);
+    var out: Splat2d;
+    var direction = vec3(0.0);
+    if i < window.count {
+        out = without_color(i);
+        direction = out.color;
+    }
+    let is_drawn = out.radii.x > 0.0;
+    var color = color_of(i, local, is_drawn, direction);
+    // Tested before max(), which may turn NaN into 0.
+    if is_drawn && is_finite3(color) {
+        if mode.sh_stride != 0u {
+            color = max(color, vec3(0.0));
+        }
+        out.color = color;
         splats2d[i] = out;
         keys[i] = depth_key(out.depth);
+    } else if i < window.count {
+        splats2d[i].radii = vec2(0.0);
+        keys[i] = CULLED_KEY;
     }
 }

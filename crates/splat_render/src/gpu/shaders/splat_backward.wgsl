@@ -126,7 +126,7 @@ fn splat_backward(i: u32) -> Backward {
         keep_coefficient(i, v_color);
     } else {
         direction = view_direction(g.t);
-        v_color = select(vec3(0.0), v_color, sh_color(i, direction.xyz) > vec3(0.0));
+        v_color = select(vec3(0.0), v_color, splats2d[i].color > vec3(0.0));
         let v_direction = sh_backward(i, direction.xyz, v_color);
         let v_along =
             (v_direction - direction.xyz * dot(direction.xyz, v_direction)) / direction.w;
