@@ -1,4 +1,4 @@
-// Bindings of both texts of rasterize_backward, and what they do alike. Follows shared.wgsl.
+// Bindings and pixels of rasterize_backward, for rows and for blocks. Follows shared.wgsl.
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> chunk: Chunk;

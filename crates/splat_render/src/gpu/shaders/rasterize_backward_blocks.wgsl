@@ -165,7 +165,7 @@ fn rasterize_backward(
                     total(gv * v), total(weight * quad.v_depth), total(weight * quad.v_red),
                     total(weight * quad.v_green),
                 );
-                // Where g is not 0, alpha is opacity times the Gaussian.
+                // If g is not 0, alpha is opacity times the Gaussian.
                 high = vec2(total(weight * quad.v_blue), -total(g) / splat.opacity);
                 if SUMS == GRADIENT_ABSOLUTE {
                     absolute = vec2(total(abs(gu)), total(abs(splat.pq.y * gu + splat.r * gv)));

@@ -25,7 +25,7 @@ struct Waiting {
     moves: bool,
     // The first of them.
     next: u32,
-    // Whether it has a gradient, that of the color, seen from a direction.
+    // Whether it has a gradient: by the color, for a view direction.
     has_gradient: bool,
     v_color: vec3<f32>,
     direction: vec3<f32>,
