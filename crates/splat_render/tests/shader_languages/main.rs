@@ -4,6 +4,7 @@
 
 mod fxc_rules;
 mod limits;
+mod spirv_size;
 
 use std::fs;
 use std::io::Write;
