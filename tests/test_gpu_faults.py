@@ -39,6 +39,15 @@ def test_auto_warns_once_and_uses_the_cpu(fault, message):
         _core.resolve_backend("gpu")
 
 
+def test_plain_kernels_replace_kernels_for_gpus_that_fail():
+    _core.inject_gpu_faults(["real", "blocks"])
+    with pytest.warns(UserWarning, match="computes wrong values: rasterize") as caught:
+        assert _core.resolve_backend("auto") == "gpu"
+    assert str(caught[0].message).endswith("Slower kernels, which pass, are used instead")
+    kernels = _core.backend_info("gpu")["instruction_set"]
+    assert kernels == "WGSL for software drivers, because that for GPUs fails here"
+
+
 @pytest.mark.filterwarnings("error")
 def test_a_software_adapter_gives_no_warning():
     _core.inject_gpu_faults([])

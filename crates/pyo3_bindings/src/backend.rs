@@ -92,20 +92,26 @@ pub fn gpu() -> PyResult<Arc<Gpu>> {
     }
 }
 
-/// Whether "auto" is the GPU and, the first time that one answers and cannot be used, why not.
+/// Whether "auto" is the GPU and, the first time that one answers and cannot be used in full, why not.
 fn auto() -> (bool, Option<String>) {
     let mut devices = Devices::lock();
-    let reason = match devices.real() {
-        Ok(_) => return (true, None),
+    let (real, warning) = match devices.real() {
+        Ok(gpu) => match gpu.fallback() {
+            None => return (true, None),
+            Some(reason) => {
+                (true, format!("{reason}. Slower kernels, which pass, are used instead"))
+            }
+        },
         Err(Error::NoAdapter(_)) => return (false, None),
-        Err(error) => error.to_string(),
+        Err(error) => (false, format!("{error}. The CPU computes instead")),
     };
-    let told = std::mem::replace(&mut devices.warned, true);
-    (false, (!told).then(|| format!("{reason}. The CPU computes instead")))
+    let warned = std::mem::replace(&mut devices.warned, true);
+    (real, (!warned).then_some(warning))
 }
 
 /// For tests: closes the devices, and makes adapters fail from here on. `faults` are of "real" (a
-/// software adapter passes for a real one), "shader", "values", "limits" and "memory".
+/// software adapter passes for a real one), "shader", "values", "blocks" (values of kernels for GPUs),
+/// "limits" and "memory".
 #[pyfunction]
 pub fn inject_gpu_faults(faults: Vec<String>) -> PyResult<()> {
     let mut injected = Injected::default();
@@ -114,6 +120,7 @@ pub fn inject_gpu_faults(faults: Vec<String>) -> PyResult<()> {
             "real" => injected.passes_for_real = true,
             "shader" => injected.bad_shader = true,
             "values" => injected.wrong_values = true,
+            "blocks" => injected.wrong_blocks = true,
             "limits" => injected = injected.with_low_limits(),
             "memory" => injected.buffer_bytes = Some(1 << 20),
             _ => return Err(PyValueError::new_err(format!("faults: there is no {fault:?}"))),
@@ -172,7 +179,15 @@ pub fn backend_info<'py>(py: Python<'py>, name: &str) -> PyResult<Bound<'py, PyD
     let (device, instruction_set) = match Backend::named(name)? {
         Backend::Cpu => (host, cpu::instruction_set()),
         Backend::Reference => (host, "scalar f64"),
-        Backend::Gpu => (py.detach(gpu)?.name(), "WGSL"),
+        Backend::Gpu => {
+            let gpu = py.detach(gpu)?;
+            let kernels = match (gpu.draws_blocks(), gpu.fallback()) {
+                (true, _) => "WGSL for GPUs",
+                (_, None) => "WGSL for software drivers",
+                (_, Some(_)) => "WGSL for software drivers, because that for GPUs fails here",
+            };
+            (gpu.name(), kernels)
+        }
     };
     let info = PyDict::new(py);
     info.set_item("backend", name)?;

@@ -52,6 +52,18 @@ fn wrong_values_are_found_and_the_stage_is_named() {
     assert!(found.contains(&gpu.name()), "{found}");
 }
 
+/// No kernel for GPUs was run on more than one GPU: if they fail on another, it is used with the plain ones.
+#[test]
+fn plain_kernels_replace_those_for_gpus_if_these_fail() {
+    let injected = Injected { wrong_blocks: true, ..Injected::default() };
+    let found = message(self_test(&Arc::new(faulty(&injected))));
+    assert!(found.contains("computes wrong values: rasterize"), "{found}");
+    let gpu = open_tested_with(true, &injected).unwrap_or_else(|e| panic!("{e}"));
+    assert!(!gpu.draws_blocks() && gpu.fallback() == Some(found.as_str()), "{:?}", gpu.fallback());
+    let injected = Injected { wrong_values: true, ..injected };
+    assert!(message(open_tested_with(true, &injected).map(drop)).contains("rasterize"));
+}
+
 #[test]
 fn an_adapter_below_the_limits_is_refused_by_the_limit() {
     let injected = Injected::default().with_low_limits();

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use super::self_test::self_test;
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::gpu::{Gpu, Injected, shader_variants};
 use crate::io::write_atomically;
 
@@ -26,12 +26,26 @@ pub fn open_tested_with(software_allowed: bool, injected: &Injected) -> Result<A
     if verdict.as_ref().is_some_and(|path| path.is_file()) {
         return Ok(gpu);
     }
-    self_test(&gpu)?;
+    if let Err(error) = self_test(&gpu) {
+        return if gpu.draws_blocks() {
+            plain(software_allowed, injected, error)
+        } else {
+            Err(error)
+        };
+    }
     if let Some(path) = verdict {
         // A folder that cannot be written costs the test again, no more.
         let _ = path.parent().map(std::fs::create_dir_all);
         let _ = write_atomically(&path, |out| writeln!(out, "{} passed", gpu.name()));
     }
+    Ok(gpu)
+}
+
+/// A device with the plain kernels, after those for GPUs failed with `error`; that error if these fail, too.
+fn plain(software_allowed: bool, injected: &Injected, error: Error) -> Result<Arc<Gpu>> {
+    let gpu = Gpu::with_faults(software_allowed, injected)?.falling_back(error.to_string());
+    let gpu = Arc::new(gpu);
+    self_test(&gpu).map_err(|_| error)?;
     Ok(gpu)
 }
 

@@ -122,7 +122,7 @@ impl Gpu {
         let threads = sharing.threads();
         let shares = adapter.features().contains(wgpu::Features::SUBGROUP)
             && (info.subgroup_min_size, info.subgroup_max_size) == (threads, threads);
-        let build = match (software, shares) {
+        let build = match (software && !injected.wrong_blocks, shares) {
             (false, _) => real,
             (true, true) => sharing,
             (true, false) => plain,
@@ -184,6 +184,7 @@ impl Gpu {
             groups_max,
             build,
             checks_shaders: std::env::var_os("IGSR_GPU_CHECKS").is_some_and(|value| value == "1"),
+            fallback: None,
             list_limit: list_limit(software, build.subgroups),
         };
         gpu.check()?;

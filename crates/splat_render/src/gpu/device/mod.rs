@@ -47,6 +47,8 @@ pub struct Gpu {
     /// Most workgroups in one dimension of a dispatch.
     pub(super) groups_max: u32,
     build: Build,
+    /// Why the kernels for GPUs are not used on a GPU.
+    fallback: Option<String>,
     /// Whether naga adds checks of indices, divisors and loops to the kernels.
     checks_shaders: bool,
     /// Pairs of a tile that one dispatch of the rasterize kernels walks.
@@ -92,6 +94,24 @@ impl Gpu {
         self.list_limit = list_limit(self.is_software(), false);
         self.pipelines = Kernel::ALL.iter().map(|_| OnceLock::new()).collect();
         self
+    }
+
+    /// Uses the kernels of software drivers, which need less of a GPU's compiler, because of an error.
+    #[must_use]
+    pub fn falling_back(mut self, error: String) -> Self {
+        self.build = Build::ALL[2];
+        self.fallback = Some(error);
+        self
+    }
+
+    /// Whether the kernels are those for GPUs.
+    pub fn draws_blocks(&self) -> bool {
+        self.build.blocks
+    }
+
+    /// Why the kernels for GPUs are not used on a GPU, if so.
+    pub fn fallback(&self) -> Option<&str> {
+        self.fallback.as_deref()
     }
 
     /// Builds kernels as for discrete GPUs, wherever they run, so that tests see that way too.
