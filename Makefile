@@ -109,9 +109,8 @@ test: check-system check-rust check-python
 
 # The tests of a file share a process here: two processes that build the wheel overwrite each other's.
 test-long: check-system build $(VENV)/.dev-ready $(VENV)/ray
-	for gpu in discrete no-subgroups; do \
-		IGSR_TEST_GPU=$$gpu RUST_TEST_THREADS=1 $(CARGO_TEST) --test gpu_stages || exit 1; done
-	IGSR_GPU_CHECKS=1 RUST_TEST_THREADS=1 $(CARGO_TEST) --test gpu_stages
+	IGSR_TEST_GPU=discrete RUST_TEST_THREADS=1 $(CARGO_TEST) --test gpu_stages
+	IGSR_TEST_GPU=no-subgroups IGSR_GPU_CHECKS=1 RUST_TEST_THREADS=1 $(CARGO_TEST) --test gpu_stages
 	$(PYTEST) --dist loadfile -m long --ignore=tests/test_blocks_ray.py
 	PYTHONPATH="$(CURDIR)/$(VENV)/ray" $(BIN)/python -m pytest -m long tests/test_blocks_ray.py
 

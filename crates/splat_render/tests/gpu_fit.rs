@@ -338,13 +338,18 @@ fn running_out_of_room_for_pairs_changes_nothing() {
     for scale in capture.start.splats.scales.as_flattened_mut() {
         *scale += 2.6;
     }
-    let (whole, losses) = run(&mut gpu_fit(), &capture, 20, 100.0);
-    let small = gpu().with_binding_limit(128 * 96 * 48);
-    let (parts, losses_parts) = run(&mut GpuFit::new(Arc::new(small)), &capture, 20, 100.0);
-    assert!(whole == parts && losses == losses_parts, "a smaller device gave other bits");
-    // Steps that are done again do not move colors twice.
-    let (dense, _) = run(&mut gpu_fit().with_color_wait(1), &capture, 20, 100.0);
-    assert!(whole == dense, "waiting for room changed bits");
+    let ways: [fn(Gpu) -> Gpu; 2] = [|gpu| gpu, Gpu::as_discrete];
+    for of in ways {
+        let large = Arc::new(of(gpu()));
+        let (whole, losses) = run(&mut GpuFit::new(Arc::clone(&large)), &capture, 20, 100.0);
+        let small = of(gpu()).with_binding_limit(128 * 96 * 48);
+        let (parts, losses_parts) = run(&mut GpuFit::new(Arc::new(small)), &capture, 20, 100.0);
+        assert!(whole == parts && losses == losses_parts, "a smaller device gave other bits");
+        // Steps that are done again do not move colors twice.
+        let mut dense = GpuFit::new(large).with_color_wait(1);
+        let (dense, _) = run(&mut dense, &capture, 20, 100.0);
+        assert!(whole == dense, "waiting for room changed bits");
+    }
 }
 
 #[test]

@@ -9,7 +9,7 @@ use bytemuck::Zeroable;
 
 use super::device::{Gpu, Groups, Op};
 use super::kernels::Kernel;
-use super::layout::{ALL_SPLATS, Chunk, ChunkCount, SortPass, StatusHead};
+use super::layout::{ALL_SPLATS, Chunk, ChunkCount, SUM_ROWS, SUM_SETS, SortPass, StatusHead};
 use super::project::Projection;
 use crate::constants::TILE;
 use crate::error::{Error, Result};
@@ -237,13 +237,13 @@ impl SplatBins {
         keys: &[wgpu::Buffer; 2],
         values: &[wgpu::Buffer; 2],
     ) -> Vec<Op> {
+        debug_assert!(gpu.digit_bits() != 8 || passes >= 2, "{passes}");
         let mut ops = Vec::new();
         for pass in 0..passes {
             let uniform = gpu.uniform(&SortPass {
                 shift: pass * gpu.digit_bits(),
                 is_first: if pass == 0 { first.is_first } else { 0 },
-                // The pass before, of this sort or the last, has used another row of sums.
-                sums: if pass + 1 == passes { 2 } else { pass % 2 },
+                sum_set: if pass + 1 == passes { 2 } else { pass % 2 },
                 ..first
             });
             let (from, to) = ((pass % 2) as usize, ((pass + 1) % 2) as usize);
@@ -310,12 +310,9 @@ impl SplatBins {
     }
 }
 
-/// As in bin_sort_wide.wgsl.
-const SUM_ROWS: u32 = 36;
-
 /// Rows of counts in the histogram; the sort by eight bits has sums of segments, too.
 fn histogram_rows(gpu: &Gpu) -> u32 {
-    gpu.segments() + if gpu.digit_bits() == 8 { 3 * SUM_ROWS } else { 0 }
+    gpu.segments() + if gpu.digit_bits() == 8 { SUM_SETS * SUM_ROWS } else { 0 }
 }
 
 /// Passes that order the ids of `tiles` tiles and the one behind them; the sort by eight bits needs two.

@@ -168,8 +168,13 @@ pub(super) struct SortPass {
     pub chunk: u32,
     pub is_first: u32,
     pub keeps_culled: u32,
-    pub sums: u32,
+    pub sum_set: u32,
 }
+
+/// Rows of one set of sums in bin_sort_wide.wgsl: of 8 segments and of 64.
+pub(super) const SUM_ROWS: u32 = 256 / 8 + 256 / 64;
+/// Sets of them.
+pub(super) const SUM_SETS: u32 = 3;
 
 /// `SortPass::chunk` for the sort of all splats by depth.
 pub(super) const ALL_SPLATS: u32 = u32::MAX;

@@ -16,7 +16,8 @@ use crate::gpu::{Gpu, GpuFit};
 use crate::reference::Reference;
 use crate::splats::SplatArrays;
 use crate::stages::{
-    AdamState, AdamStep, Exposure, ImageGradients, ProjectOptions, Rates, SplatGradients, Stages,
+    AdamState, AdamStep, Exposure, ImageGradients, ProjectOptions, Projected, Rates,
+    SplatGradients, Stages,
 };
 use crate::target::{Target, TargetDepth};
 
@@ -26,6 +27,10 @@ const TOLERANCE: f64 = 1e-3;
 const SEED: u32 = 97;
 const SPLATS: usize = 40;
 const SIZE: (u32, u32) = (56, 40);
+/// Splats of the crowd: enough for every sum of the sort, and for several batches in each tile.
+const CROWD: usize = 20_000;
+/// Maximum difference in the crowd, of which a few pixels may decide otherwise.
+const CROWD_TOLERANCE: f64 = 0.05;
 const BACKGROUND: [f64; 3] = [0.25, 0.5, 0.75];
 
 /// Outputs of a stage as plain numbers.
@@ -38,9 +43,13 @@ pub fn self_test(gpu: &Arc<Gpu>) -> Result<()> {
     let mut expected = all_stages::<f64>(&Reference)?;
     outputs.extend(a_fit(&mut GpuFit::new(Arc::clone(gpu)))?);
     expected.extend(a_fit(&mut CpuFit::default())?);
-    for ((stage, values), (_, right)) in outputs.iter().zip(&expected) {
+    let known = outputs.len();
+    outputs.extend(a_crowd::<f32>(&**gpu)?);
+    expected.extend(a_crowd::<f64>(&Reference)?);
+    for (k, ((stage, values), (_, right))) in outputs.iter().zip(&expected).enumerate() {
         let off = difference(values, right);
-        if off.is_nan() || off > TOLERANCE {
+        let tolerance = if k < known { TOLERANCE } else { CROWD_TOLERANCE };
+        if off.is_nan() || off > tolerance {
             return Err(Error::Device(format!(
                 "backend gpu: {} computes wrong values: {stage} is off by {off:.1e} of the largest; \
                  update its driver or use backend cpu",
@@ -202,6 +211,37 @@ fn all_stages<T: Float>(stages: &impl Stages<T>) -> Result<Outputs> {
         ("adam", flat(&state.splats.means)),
         ("adam", flat(&state.splats.scales)),
         ("adam", flat(&state.splats.sh)),
+    ])
+}
+
+/// Faint small splats all over the picture, rasterized and back.
+fn a_crowd<T: Float + Default>(stages: &impl Stages<T>) -> Result<Outputs> {
+    let (width, height) = SIZE;
+    let mut crowd = Projected::<T>::culled(CROWD, width, height);
+    for i in 0..CROWD {
+        let number = |k: usize| draw(100_000 + 8 * i + k);
+        let deviation = 0.6 + 0.4 * number(0);
+        let opacity = 0.02 + 0.01 * number(1);
+        let radius = deviation * (2.0 * (255.0 * opacity).ln()).sqrt();
+        crowd.means2d[i] = [f64::from(width) * number(2), f64::from(height) * number(3)].map(cast);
+        crowd.factors[i] = [deviation.recip(), 0.0, deviation.recip()].map(cast);
+        crowd.opacities[i] = cast(opacity);
+        crowd.radii[i] = [cast(radius); 2];
+        crowd.depths[i] = cast(1.0 + number(4));
+        crowd.colors[i] = [5, 6, 7].map(|k| cast(number(k)));
+    }
+    let image = stages.rasterize(&crowd, BACKGROUND.map(cast))?;
+    let pixels = image.depth.len();
+    let v_image = ImageGradients {
+        v_color: (0..pixels).map(|k| [0, 1, 2].map(|c| cast(draw(3 * k + c) - 0.5))).collect(),
+        v_alpha: vec![cast(0.0); pixels],
+        v_depth: vec![cast(0.0); pixels],
+    };
+    let v = stages.rasterize_backward(&crowd, BACKGROUND.map(cast), &image, &v_image, false)?;
+    Ok(vec![
+        ("rasterize", flat(&image.color)),
+        ("rasterize_backward", flat(&v.v_means2d)),
+        ("rasterize_backward", plain(&v.v_opacities)),
     ])
 }
 

@@ -27,7 +27,7 @@ pub fn open_tested_with(software_allowed: bool, injected: &Injected) -> Result<A
         return Ok(gpu);
     }
     if let Err(error) = self_test(&gpu) {
-        return if gpu.draws_blocks() {
+        return if gpu.is_for_gpus() {
             plain(software_allowed, injected, error)
         } else {
             Err(error)
@@ -56,7 +56,11 @@ fn verdict_file(gpu: &Gpu) -> Option<PathBuf> {
     (&info.name, info.vendor, info.device, &info.driver, &info.driver_info).hash(&mut key);
     format!("{:?} {:?}", info.backend, info.device_type).hash(&mut key);
     env!("CARGO_PKG_VERSION").hash(&mut key);
-    shader_variants().for_each(|variant| variant.text.hash(&mut key));
+    gpu.checks_shaders().hash(&mut key);
+    for variant in shader_variants() {
+        variant.text.hash(&mut key);
+        format!("{:?}", variant.constants).hash(&mut key);
+    }
     Some(folder()?.join(format!("{:016x}.passed", key.finish())))
 }
 

@@ -64,8 +64,8 @@ pub fn rng(seed: u64) -> Pcg64 {
 }
 
 /// Any adapter, software ones included; if there is none, the test fails with the error's sentence.
-/// `make test-long` runs the tests of the GPU with each build of the kernels: `IGSR_TEST_GPU` is
-/// `discrete` or `no-subgroups`.
+/// `make test-long` runs the stages' tests with each build of the kernels: `IGSR_TEST_GPU` is `discrete`
+/// or `no-subgroups`.
 pub fn gpu() -> Gpu {
     let gpu = Gpu::new(true).unwrap_or_else(|e| panic!("{e}"));
     match std::env::var("IGSR_TEST_GPU").as_deref() {

@@ -43,15 +43,15 @@ fn size(shader: &Compiled) -> [usize; 3] {
 fn kernels_of_a_step_stay_small() {
     // Most instructions, loops and variables of functions.
     let bounds = [
-        ("fit_project, blocks, project", [2900, 3, 50]),
-        ("fit_geometry, blocks, fit_geometry", [3700, 12, 52]),
-        ("bin_sort_wide, blocks, sort_count", [450, 1, 6]),
-        ("bin_sort_wide, blocks, sort_place", [820, 7, 20]),
-        ("rasterize, blocks, rasterize", [1600, 4, 27]),
-        ("loss, blocks, loss_slopes", [900, 5, 15]),
-        ("loss, blocks, loss_gradient", [950, 5, 17]),
-        ("rasterize_backward, blocks, rasterize_backward", [2300, 7, 36]),
-        ("rasterize_backward_sum, blocks, rasterize_backward_sum", [780, 4, 12]),
+        ("fit_project, GPUs, project", [2900, 3, 50]),
+        ("fit_geometry, GPUs, fit_geometry", [3700, 12, 52]),
+        ("bin_sort_wide, GPUs, sort_count", [450, 1, 6]),
+        ("bin_sort_wide, GPUs, sort_place", [820, 7, 20]),
+        ("rasterize, GPUs, rasterize", [1600, 4, 27]),
+        ("loss, GPUs, loss_slopes", [900, 5, 15]),
+        ("loss, GPUs, loss_gradient", [950, 5, 17]),
+        ("rasterize_backward, GPUs, rasterize_backward", [2300, 7, 36]),
+        ("rasterize_backward_sum, GPUs, rasterize_backward_sum", [780, 4, 12]),
     ];
     let shaders = compiled();
     for (name, most) in bounds {

@@ -92,9 +92,10 @@ impl Gpu {
                 int_div_checks: self.checks_shaders,
                 ..wgpu::ShaderRuntimeChecks::checked()
             };
-            // SAFETY: the text is this crate's. Its loops count to an end, as a test of gpu/kernels
-            // asserts; it divides integers by constants and sizes above 0; and the counts on the device
-            // by which it indexes are at most the sizes of the buffers.
+            // SAFETY: the text is this crate's. Its loops are counting ones (a test of gpu/kernels looks
+            // at their heads); it divides integers by constants and sizes above 0; and it indexes by
+            // counts on the device that fit the buffers: if the pairs of a chunk do not, bin_scan makes
+            // their number 0 and the dispatches that follow empty.
             let module = unsafe { self.device.create_shader_module_trusted(descriptor, checks) };
             let bindings = bind_group_layout(&self.device, source);
             let layout = self.device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
@@ -110,7 +111,7 @@ impl Gpu {
                 entry_point: Some(entry),
                 compilation_options: wgpu::PipelineCompilationOptions {
                     constants: &constants,
-                    // Every kernel writes workgroup memory before it reads it.
+                    // Every kernel writes workgroup memory first, or does not use what it reads.
                     zero_initialize_workgroup_memory: self.checks_shaders,
                 },
                 cache: None,

@@ -87,10 +87,10 @@ impl Gpu {
         self
     }
 
-    /// Disables subgroups, so that tests cover both ways.
+    /// Uses the kernels for software adapters without subgroups, so that tests cover them.
     #[must_use]
     pub fn without_subgroups(mut self) -> Self {
-        self.build.subgroups = false;
+        self.build = Build::ALL[2];
         self.list_limit = list_limit(self.is_software(), false);
         self.pipelines = Kernel::ALL.iter().map(|_| OnceLock::new()).collect();
         self
@@ -105,8 +105,13 @@ impl Gpu {
     }
 
     /// Whether the kernels are those for GPUs.
-    pub fn draws_blocks(&self) -> bool {
-        self.build.blocks
+    pub fn is_for_gpus(&self) -> bool {
+        self.build.for_gpus
+    }
+
+    /// Whether naga adds checks of indices, divisors and loops to the kernels, and zeros workgroup memory.
+    pub fn checks_shaders(&self) -> bool {
+        self.checks_shaders
     }
 
     /// Why the kernels for GPUs are not used on a GPU, if so.

@@ -499,7 +499,8 @@ impl FitDevice for GpuFit {
         self.redone = None;
         self.waiting.clear();
         // Keep the capacity of the last scene, which is likely to be needed again.
-        let (capacity, chunks) = self.scene.take().map_or((0, 1), |s| (s.capacity, s.chunks));
+        let capacity = self.scene.take().map_or(0, |scene| scene.capacity);
+        let chunks = self.frames.iter().map(|frame| frame.chunks.len() as u32).max().unwrap_or(1);
         for frame in &mut self.frames {
             frame.ops.clear();
         }

@@ -13,7 +13,7 @@ use crate::fit_device::{
 };
 use crate::gpu::layout::{
     CAMERA, DEPTH_GROUPS, EXPOSURE_GROUPS, GEOMETRY, GRADIENT, GRADIENT_ABSOLUTE, NOTE_COLOR,
-    NOTE_DIRECTION, NOTE_PULL, NOTE_SEEN, NOTE_WAITS, NOTES,
+    NOTE_DIRECTION, NOTE_PULL, NOTE_SEEN, NOTE_WAITS, NOTES, SUM_ROWS,
 };
 use crate::sh;
 
@@ -34,6 +34,7 @@ pub(super) fn constants(rows: u32) -> String {
         ("COLOR_WAIT", COLOR_WAIT as u32),
         ("EXPOSURE_GROUPS", EXPOSURE_GROUPS),
         ("DEPTH_GROUPS", DEPTH_GROUPS),
+        ("SUM_ROWS", SUM_ROWS),
         ("SH_COEFFS_MAX", SH_COEFFS_MAX as u32),
         ("BINS", BINS as u32),
         ("SHARES_MAX", SHARES_MAX as u32),

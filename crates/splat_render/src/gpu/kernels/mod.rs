@@ -9,6 +9,7 @@ use constants::constants;
 pub(super) use table::Kernel;
 
 use crate::constants::TILE;
+use crate::gpu::layout::{SUM_ROWS, SUM_SETS};
 
 /// Declarations and functions at the start of every shader.
 const SHARED: &str = include_str!("../shaders/shared.wgsl");
@@ -24,9 +25,10 @@ pub(super) enum Access {
 /// Build parameters of the shaders for one kind of adapter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Build {
-    /// Whether the rasterize kernels draw blocks of pixels, one thread a pixel.
-    pub blocks: bool,
-    /// Pixel rows per thread of rasterize kernels without blocks; software adapters read slowly.
+    /// Whether sources use their parts for GPUs, if they have some.
+    pub for_gpus: bool,
+    /// Pixel rows per thread of the rasterize kernels for software adapters: many, because each read of a
+    /// splat takes long.
     pub rows: u32,
     /// Whether a tile's threads are one subgroup and share data through it.
     pub subgroups: bool,
@@ -37,11 +39,14 @@ pub(super) struct Build {
     pub segments: u32,
 }
 
+/// As bin_sort_wide.wgsl has it.
+const _: () = assert!(Build::ALL[0].segments == 256 && SUM_SETS * SUM_ROWS <= 256);
+
 impl Build {
     /// For GPUs, and for software adapters with and without subgroups of a tile's threads.
     pub const ALL: [Self; 3] = [
         Self {
-            blocks: true,
+            for_gpus: true,
             rows: 8,
             subgroups: false,
             digit_bits: 8,
@@ -49,7 +54,7 @@ impl Build {
             segments: 256,
         },
         Self {
-            blocks: false,
+            for_gpus: false,
             rows: 8,
             subgroups: true,
             digit_bits: 4,
@@ -57,7 +62,7 @@ impl Build {
             segments: 16,
         },
         Self {
-            blocks: false,
+            for_gpus: false,
             rows: 8,
             subgroups: false,
             digit_bits: 4,
@@ -80,8 +85,8 @@ pub(super) struct Source {
     parts: &'static [&'static str],
     /// Text for cooperating threads of a tile: for any device, and for tiles that are subgroups.
     tile_work: Option<[&'static str; 2]>,
-    /// Texts in place of both for builds that draw blocks.
-    blocks: Option<&'static [&'static str]>,
+    /// Texts in place of both on GPUs.
+    gpu_parts: Option<&'static [&'static str]>,
     /// Whether the source has the override `SEGMENTS`.
     segmented: bool,
 }
@@ -118,7 +123,7 @@ pub fn shader_variants() -> impl Iterator<Item = ShaderVariant> {
             name: format!(
                 "{}, {}{}",
                 source.name,
-                if build.blocks { "blocks" } else { "rows" },
+                if build.for_gpus { "GPUs" } else { "software" },
                 if build.subgroups { ", subgroups" } else { "" }
             ),
             text: source.text(build),
@@ -147,15 +152,15 @@ impl Source {
         parts: &'static [&'static str],
         bindings: &'static [Access],
     ) -> Self {
-        Self { name, bindings, parts, tile_work: None, blocks: None, segmented: false }
+        Self { name, bindings, parts, tile_work: None, gpu_parts: None, segmented: false }
     }
 
     const fn with_tile_work(self, texts: [&'static str; 2]) -> Self {
         Self { tile_work: Some(texts), ..self }
     }
 
-    const fn with_blocks(self, parts: &'static [&'static str]) -> Self {
-        Self { blocks: Some(parts), ..self }
+    const fn with_gpu_parts(self, parts: &'static [&'static str]) -> Self {
+        Self { gpu_parts: Some(parts), ..self }
     }
 
     const fn segmented(self) -> Self {
@@ -164,12 +169,12 @@ impl Source {
 
     pub fn text(&self, build: Build) -> String {
         let mut text = constants(build.rows);
-        let blocks = self.blocks.filter(|_| build.blocks);
-        if let (Some(texts), None) = (self.tile_work, blocks) {
+        let gpu_parts = self.gpu_parts.filter(|_| build.for_gpus);
+        if let (Some(texts), None) = (self.tile_work, gpu_parts) {
             text.push_str(texts[usize::from(build.subgroups)]);
         }
         text.push_str(&repeat_rows(SHARED, build.rows));
-        for part in blocks.unwrap_or(self.parts) {
+        for part in gpu_parts.unwrap_or(self.parts) {
             text.push_str(&repeat_rows(part, build.rows));
         }
         text

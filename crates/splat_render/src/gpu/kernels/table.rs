@@ -156,7 +156,7 @@ static FIT_PROJECT: Source = Source::new(
         Read, Uniform,
     ],
 )
-.with_blocks(&[
+.with_gpu_parts(&[
     GEOMETRY_READ,
     COLORS_UPDATED,
     GEOMETRY_WGSL,
@@ -287,12 +287,12 @@ static RASTERIZE: Source = Source::new(
     &[Uniform, Uniform, Read, Read, Read, ReadWrite, ReadWrite],
 )
 .with_tile_work(TILE_WORK)
-.with_blocks(&[BIN_TILES, TILE_BLOCKS, include_str!("../shaders/rasterize_blocks.wgsl")]);
+.with_gpu_parts(&[BIN_TILES, TILE_BLOCKS, include_str!("../shaders/rasterize_blocks.wgsl")]);
 
 static RASTERIZE_BACKWARD: Source =
     Source::new("rasterize_backward", &[SIGNED, BACKWARD_PIXELS, BACKWARD], &BACKWARD_BINDINGS)
         .with_tile_work(TILE_SUMS)
-        .with_blocks(&[SIGNED, BACKWARD_PIXELS, BIN_TILES, TILE_BLOCKS, BACKWARD_BLOCKS]);
+        .with_gpu_parts(&[SIGNED, BACKWARD_PIXELS, BIN_TILES, TILE_BLOCKS, BACKWARD_BLOCKS]);
 
 static RASTERIZE_BACKWARD_ABSOLUTE: Source = Source::new(
     "rasterize_backward_absolute",
@@ -300,7 +300,7 @@ static RASTERIZE_BACKWARD_ABSOLUTE: Source = Source::new(
     &BACKWARD_BINDINGS,
 )
 .with_tile_work(TILE_SUMS)
-.with_blocks(&[ABSOLUTE, BACKWARD_PIXELS, BIN_TILES, TILE_BLOCKS, BACKWARD_BLOCKS]);
+.with_gpu_parts(&[ABSOLUTE, BACKWARD_PIXELS, BIN_TILES, TILE_BLOCKS, BACKWARD_BLOCKS]);
 
 static RASTERIZE_BACKWARD_SUM: Source =
     Source::new("rasterize_backward_sum", &[SIGNED, BACKWARD_SUM], &BACKWARD_SUM_BINDINGS);

@@ -129,7 +129,7 @@ fn rust_and_wgsl_agree_on_layouts() {
         DepthKeys, Chunk as "Chunk":
             tile_begin tile_end capacity splats index is_first is_last list_begin list_end groups_max;
         ScanSums, ChunkCount as "ChunkCount": pairs total;
-        SortCount, SortPass as "SortPass": shift chunk is_first keeps_culled sums;
+        SortCount, SortPass as "SortPass": shift chunk is_first keeps_culled sum_set;
         DepthLoss, DepthStep as "DepthStep": scale;
         Exposure, ExposureUniform as "Exposure": gain offset behind background;
         AdamColors, Step as "Step":

@@ -1,4 +1,5 @@
-// Bindings and pixels of rasterize_backward, for rows and for blocks. Follows shared.wgsl.
+// Bindings and pixels of rasterize_backward, for rows and for blocks. Follows shared.wgsl
+// and SUMS; a later file declares THREADS.
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> chunk: Chunk;

@@ -10,8 +10,8 @@ struct SortPass {
     is_first: u32,
     // 1 if culled splats stay, at the end.
     keeps_culled: u32,
-    // The wide sort's sums of segments that this pass uses, not the previous pass's.
-    sums: u32,
+    // The set of sums of bin_sort_wide.wgsl.
+    sum_set: u32,
 }
 
 const ALL_SPLATS = 0xffffffffu;

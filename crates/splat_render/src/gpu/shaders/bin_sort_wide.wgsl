@@ -5,8 +5,9 @@
 
 @group(0) @binding(2) var<storage, read> keys_in: array<u32>;
 @group(0) @binding(3) var<storage, read> values_in: array<u32>;
-// Rows of a count for each digit: SEGMENTS of segments, then 3 times SUM_ROWS of sums, of 8 and of 64
-// segments. A pass uses one of the three and clears the rest.
+// Rows of a count for each digit: one for each segment, then three sets of sums, of 8 and of 64 segments. A
+// pass adds to one set and clears the rest. A sort has two passes or more; the first uses set 0, the last
+// set 2, so that no two passes in a row share a set.
 @group(0) @binding(4) var<storage, read_write> histogram: array<atomic<u32>>;
 @group(0) @binding(5) var<storage, read_write> keys_out: array<u32>;
 @group(0) @binding(6) var<storage, read_write> values_out: array<u32>;
@@ -14,8 +15,7 @@
 override SEGMENTS: u32 = 64u;
 const THREADS = 256u; // one for each digit
 const WORDS = 8u; // THREADS / 32
-const EIGHTS = 32u; // of 256 segments
-const SUM_ROWS = 36u; // EIGHTS and four of 64 segments
+const EIGHTS = 32u; // of 256 segments; SUM_ROWS has four of 64, too
 
 // [digit][word]: which threads have the digit.
 var<workgroup> masks: array<atomic<u32>, 2048>;
@@ -43,7 +43,7 @@ fn sort_count(
     @builtin(local_invocation_index) local: u32,
 ) {
     let range = segment_range(same_for_all(local), workgroup.x);
-    let sums = SEGMENTS + pass_.sums * SUM_ROWS;
+    let sums = SEGMENTS + pass_.sum_set * SUM_ROWS;
     let other = SEGMENTS + workgroup.x;
     if workgroup.x < 3u * SUM_ROWS && (other < sums || other >= sums + SUM_ROWS) {
         atomicStore(&histogram[other * THREADS + local], 0u);
@@ -81,7 +81,7 @@ fn sort_place(
     }
     var before = 0u;
     var total = 0u;
-    let eights = SEGMENTS + pass_.sums * SUM_ROWS;
+    let eights = SEGMENTS + pass_.sum_set * SUM_ROWS;
     for (var many = 0u; many < SUM_ROWS - EIGHTS; many++) {
         let count = row(eights + EIGHTS + many, local);
         before += select(0u, count, many < workgroup.x / 64u);

@@ -4,9 +4,16 @@
 @group(0) @binding(4) var<storage, read_write> splats2d: array<Splat2d>;
 @group(0) @binding(5) var<storage, read_write> keys: array<u32>;
 
-// The direction from the camera in place of the color; radii (0, 0) if culled.
-fn without_color(i: u32) -> Splat2d {
+struct Uncolored {
+    // Radii (0, 0) if culled.
+    splat: Splat2d,
+    // From the camera.
+    direction: vec3<f32>,
+}
+
+fn project_one(i: u32) -> Uncolored {
     var out: Splat2d;
+    var direction = vec3(0.0);
     let g = load_geometry(i);
     // ALPHA_MIN also stops opacities that are zero, negative or underflown.
     if g.visible && g.opacity > ALPHA_MIN {
@@ -37,14 +44,14 @@ fn without_color(i: u32) -> Splat2d {
         if finite && in_picture && all(radii > vec2(0.0)) {
             out.mean = center;
             out.pq = vec2(p, q);
-            out.color = view_direction(g.t).xyz;
+            direction = view_direction(g.t).xyz;
             out.r = r;
             out.depth = g.t.z;
             out.opacity = opacity;
             out.radii = radii;
         }
     }
-    return out;
+    return Uncolored(out, direction);
 }
 
 @compute @workgroup_size(64)
@@ -55,14 +62,13 @@ fn project(
 ) {
     look_up_mode(workgroup);
     let i = linear_index(workgroup, groups, local, 64u);
-    var out: Splat2d;
-    var direction = vec3(0.0);
+    var projected: Uncolored;
     if i < window.count {
-        out = without_color(i);
-        direction = out.color;
+        projected = project_one(i);
     }
+    var out = projected.splat;
     let is_drawn = out.radii.x > 0.0;
-    var color = color_of(i, local, is_drawn, direction);
+    var color = color_of(i, local, is_drawn, projected.direction);
     // Tested before max(), which may turn NaN into 0.
     if is_drawn && is_finite3(color) {
         if mode.sh_stride != 0u {

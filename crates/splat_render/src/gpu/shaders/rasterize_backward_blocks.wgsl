@@ -5,6 +5,8 @@
 
 const BATCH = 32u;
 const ITEMS = 4u;
+// `touched` has one word for each block.
+const_assert WORDS == 1u;
 // Threads of a block that add up one splat.
 const PARTS = 32u / ITEMS;
 // One more than a block's threads, so that a column's entries lie in different memory banks.
@@ -92,6 +94,7 @@ fn rasterize_backward(
     let corner = block_corner(tile, block);
     let at = corner + vec2(lane % 8u, lane / 8u);
     let index = pixel_at(at.x, at.y);
+    // A list continues in another dispatch on software drivers alone.
     let before = transmittance_of(index);
     var pixel = Pixel(
         vec2<f32>(at) + 0.5, gradient_of(index), before > 0.0, abs(before), total_of(index),

@@ -40,6 +40,7 @@ fn rasterize(
     var color = vec3(0.0);
     var depth = 0.0;
     var transmittance = 1.0;
+    // A list continues in another dispatch on software drivers alone.
     if exists && chunk.list_begin > 0u {
         let kept = picture[pixel];
         color = kept.xyz;

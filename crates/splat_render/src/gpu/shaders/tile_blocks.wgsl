@@ -1,6 +1,6 @@
 // A tile's splats in workgroup memory, a batch at a time, and the blocks of 8x4 pixels that each touches:
 // for GPUs. 32 neighboring threads draw a block, one pixel each, and skip the splats that miss it. Follows
-// bin_tiles.wgsl; BATCH is the number of splats in a batch.
+// bin_tiles.wgsl; the file that follows declares BATCH, the number of splats in a batch.
 
 const THREADS = TILE * TILE;
 const BLOCKS = 8u;
