@@ -29,7 +29,7 @@ const SPLATS: usize = 40;
 const SIZE: (u32, u32) = (56, 40);
 /// Splats of the crowd: enough for every sum of the sort, and for several batches in each tile.
 const CROWD: usize = 20_000;
-/// Maximum difference in the crowd, of which a few pixels may decide otherwise.
+/// Maximum difference in the crowd; rounding may flip decisions at a few pixels.
 const CROWD_TOLERANCE: f64 = 0.05;
 const BACKGROUND: [f64; 3] = [0.25, 0.5, 0.75];
 

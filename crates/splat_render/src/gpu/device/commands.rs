@@ -111,7 +111,7 @@ impl Gpu {
                 entry_point: Some(entry),
                 compilation_options: wgpu::PipelineCompilationOptions {
                     constants: &constants,
-                    // Every kernel writes workgroup memory first, or does not use what it reads.
+                    // No kernel uses workgroup memory that it has not written.
                     zero_initialize_workgroup_memory: self.checks_shaders,
                 },
                 cache: None,
