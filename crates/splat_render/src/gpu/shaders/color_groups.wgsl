@@ -1,7 +1,6 @@
 // Waiting colors on GPUs: the 64 threads of a workgroup update the rows of its 64 splats together, float by
 // float, so that they read and write consecutive words. Same bits as color_rows.wgsl if a compiler fuses
-// adam_step alike. Follows
-// waiting_colors.wgsl; sh_color.wgsl follows.
+// adam_step alike. Follows waiting_colors.wgsl; sh_color.wgsl follows.
 
 const SPLATS = 64u;
 // Most coefficients of one degree, and floats of them.
