@@ -181,7 +181,7 @@ pub fn backend_info<'py>(py: Python<'py>, name: &str) -> PyResult<Bound<'py, PyD
         Backend::Reference => (host, "scalar f64"),
         Backend::Gpu => {
             let gpu = py.detach(gpu)?;
-            let kernels = match (gpu.is_for_gpus(), gpu.fallback()) {
+            let kernels = match (gpu.has_gpu_kernels(), gpu.fallback()) {
                 (true, _) => "WGSL for GPUs",
                 (_, None) => "WGSL for software drivers",
                 (_, Some(_)) => "WGSL for software drivers, because that for GPUs fails here",

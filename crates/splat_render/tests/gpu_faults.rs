@@ -59,7 +59,11 @@ fn plain_kernels_replace_those_for_gpus_if_these_fail() {
     let found = message(self_test(&Arc::new(faulty(&injected))));
     assert!(found.contains("computes wrong values: rasterize"), "{found}");
     let gpu = open_tested_with(true, &injected).unwrap_or_else(|e| panic!("{e}"));
-    assert!(!gpu.is_for_gpus() && gpu.fallback() == Some(found.as_str()), "{:?}", gpu.fallback());
+    assert!(
+        !gpu.has_gpu_kernels() && gpu.fallback() == Some(found.as_str()),
+        "{:?}",
+        gpu.fallback()
+    );
     let injected = Injected { wrong_values: true, ..injected };
     assert!(message(open_tested_with(true, &injected).map(drop)).contains("rasterize"));
 }

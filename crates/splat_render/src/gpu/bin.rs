@@ -317,11 +317,8 @@ fn histogram_rows(gpu: &Gpu) -> u32 {
 
 /// Passes that order the ids of `tiles` tiles and the one behind them; the sort by eight bits needs two.
 fn sort_passes(tiles: u32, digit_bits: u32) -> u32 {
-    (u32::BITS - tiles.leading_zeros()).div_ceil(digit_bits).max(if digit_bits == 8 {
-        2
-    } else {
-        1
-    })
+    let least = if digit_bits == 8 { 2 } else { 1 };
+    (u32::BITS - tiles.leading_zeros()).div_ceil(digit_bits).max(least)
 }
 
 impl PairBins {

@@ -27,7 +27,7 @@ pub fn open_tested_with(software_allowed: bool, injected: &Injected) -> Result<A
         return Ok(gpu);
     }
     if let Err(error) = self_test(&gpu) {
-        return if gpu.is_for_gpus() {
+        return if gpu.has_gpu_kernels() {
             plain(software_allowed, injected, error)
         } else {
             Err(error)

@@ -9,7 +9,7 @@ use std::task::{Context, Poll, Waker};
 use super::limits::check_limits;
 use super::{GROUPS_MAX, Gpu, Injected, list_limit, note, one_line};
 use crate::error::{Error, Result};
-use crate::gpu::kernels::{Build, Kernel};
+use crate::gpu::kernels::{Build, Kernel, SOFTWARE_THREADS};
 
 /// Futures of wgpu's native backends are ready at once or after `poll`.
 fn ready<T>(future: impl Future<Output = T>) -> T {
@@ -117,15 +117,14 @@ impl Gpu {
         }
         check_limits(&info.name, &offered)?;
         let software = info.device_type == wgpu::DeviceType::Cpu;
-        let [real, sharing, plain] = Build::ALL;
         // Use subgroups only on adapters for which they were measured to be faster.
-        let threads = sharing.threads();
+        let sizes = (info.subgroup_min_size, info.subgroup_max_size);
         let shares = adapter.features().contains(wgpu::Features::SUBGROUP)
-            && (info.subgroup_min_size, info.subgroup_max_size) == (threads, threads);
+            && sizes == (SOFTWARE_THREADS, SOFTWARE_THREADS);
         let build = match (software && !injected.wrong_blocks, shares) {
-            (false, _) => real,
-            (true, true) => sharing,
-            (true, false) => plain,
+            (false, _) => Build::Gpu,
+            (true, true) => Build::SoftwareSubgroups,
+            (true, false) => Build::Software,
         };
         // Accept limits below WebGPU's defaults if the kernels do not need them; request large buffers.
         let required_limits = wgpu::Limits {
@@ -140,7 +139,11 @@ impl Gpu {
             required_limits,
             // For callers that time frames.
             required_features: adapter.features() & wgpu::Features::TIMESTAMP_QUERY
-                | if build.subgroups { wgpu::Features::SUBGROUP } else { wgpu::Features::empty() },
+                | if build.subgroups() {
+                    wgpu::Features::SUBGROUP
+                } else {
+                    wgpu::Features::empty()
+                },
             memory_hints: wgpu::MemoryHints::Performance,
             ..Default::default()
         }))
@@ -185,7 +188,7 @@ impl Gpu {
             build,
             checks_shaders: std::env::var_os("IGSR_GPU_CHECKS").is_some_and(|value| value == "1"),
             fallback: None,
-            list_limit: list_limit(software, build.subgroups),
+            list_limit: list_limit(software, build.subgroups()),
         };
         gpu.check()?;
         Ok(gpu)

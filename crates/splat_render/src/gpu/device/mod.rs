@@ -87,26 +87,34 @@ impl Gpu {
         self
     }
 
-    /// Uses the kernels for software adapters without subgroups, so that tests cover them.
-    #[must_use]
-    pub fn without_subgroups(mut self) -> Self {
-        self.build = Build::ALL[2];
-        self.list_limit = list_limit(self.is_software(), false);
+    fn with_build(mut self, build: Build) -> Self {
+        self.build = build;
+        self.list_limit = list_limit(self.is_software(), build.subgroups());
         self.pipelines = Kernel::ALL.iter().map(|_| OnceLock::new()).collect();
         self
     }
 
-    /// Uses the kernels of software drivers, which need less of a GPU's compiler, because of an error.
+    /// Uses the kernels for software adapters without subgroups, so that tests cover them.
     #[must_use]
-    pub fn falling_back(mut self, error: String) -> Self {
-        self.build = Build::ALL[2];
-        self.fallback = Some(error);
-        self
+    pub fn without_subgroups(self) -> Self {
+        self.with_build(Build::Software)
     }
 
-    /// Whether the kernels are those for GPUs.
-    pub fn is_for_gpus(&self) -> bool {
-        self.build.for_gpus
+    /// Uses the kernels for software adapters, which need less of a GPU's compiler, because of an error.
+    #[must_use]
+    pub fn falling_back(self, error: String) -> Self {
+        Self { fallback: Some(error), ..self.with_build(Build::Software) }
+    }
+
+    /// Uses the kernels for GPUs, wherever they run, so that tests cover them.
+    #[must_use]
+    pub fn as_discrete(self) -> Self {
+        self.with_build(Build::Gpu)
+    }
+
+    /// Whether it uses the kernels for GPUs.
+    pub fn has_gpu_kernels(&self) -> bool {
+        self.build.is_gpu()
     }
 
     /// Whether naga adds checks of indices, divisors and loops to the kernels, and zeros workgroup memory.
@@ -119,19 +127,10 @@ impl Gpu {
         self.fallback.as_deref()
     }
 
-    /// Builds kernels as for discrete GPUs, wherever they run, so that tests see that way too.
-    #[must_use]
-    pub fn as_discrete(mut self) -> Self {
-        self.build = Build::ALL[0];
-        self.list_limit = list_limit(self.is_software(), false);
-        self.pipelines = Kernel::ALL.iter().map(|_| OnceLock::new()).collect();
-        self
-    }
-
     /// Plans work for a discrete GPU that binds `binding_limit` bytes at once, and does none of it.
     #[must_use]
     pub(super) fn planning(mut self, binding_limit: u64) -> Self {
-        self.build = Build::ALL[0];
+        self.build = Build::Gpu;
         self.list_limit = list_limit(false, false);
         self.binding_limit = binding_limit;
         self.groups_max = GROUPS_MAX;
@@ -140,15 +139,15 @@ impl Gpu {
     }
 
     pub(super) fn segments(&self) -> u32 {
-        self.build.segments
+        self.build.segments()
     }
 
     pub(super) fn digit_bits(&self) -> u32 {
-        self.build.digit_bits
+        self.build.digit_bits()
     }
 
     pub(super) fn loss_by_lines(&self) -> bool {
-        self.build.loss_by_lines
+        !self.build.is_gpu()
     }
 
     /// Name of the adapter and its driver.

@@ -2,6 +2,8 @@
 
 use std::fmt::Write;
 
+use super::ROWS;
+
 use crate::constants::{
     ADAM, ALPHA_MAX, ALPHA_MIN, DEPTH_ALPHA, QUAT_NORM2_MIN, SH_COEFFS_MAX, SSIM_C, SSIM_WINDOW,
     TILE, TRANSMITTANCE_MIN,
@@ -18,10 +20,10 @@ use crate::gpu::layout::{
 use crate::sh;
 
 /// Constants of the crate as WGSL, so that no shader repeats a value by hand.
-pub(super) fn constants(rows: u32) -> String {
+pub(super) fn constants() -> String {
     let mut out = String::new();
-    let _ = writeln!(out, "const ROWS = {rows}u;");
     for (name, value) in [("TILE", TILE), ("GEOMETRY", GEOMETRY as u32)].into_iter().chain([
+        ("ROWS", ROWS),
         ("GRADIENT", GRADIENT as u32),
         ("GRADIENT_ABSOLUTE", GRADIENT_ABSOLUTE as u32),
         ("CAMERA", CAMERA as u32),

@@ -22,57 +22,43 @@ pub(super) enum Access {
     Write,
 }
 
-/// Build parameters of the shaders for one kind of adapter.
+/// The kinds of adapters that shaders are built for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Build {
-    /// Whether sources use their parts for GPUs, if they have some.
-    pub for_gpus: bool,
-    /// Pixel rows per thread of the rasterize kernels for software adapters: many, because each read of a
-    /// splat takes long.
-    pub rows: u32,
-    /// Whether a tile's threads are one subgroup and share data through it.
-    pub subgroups: bool,
-    pub digit_bits: u32,
-    /// Whether each thread of the loss filters a whole row or column.
-    pub loss_by_lines: bool,
-    /// Workgroups per scan or sort: a few per core on a CPU, many on a GPU.
-    pub segments: u32,
+pub(super) enum Build {
+    Gpu,
+    /// A software adapter on which a tile's threads are one subgroup and share data through it.
+    SoftwareSubgroups,
+    Software,
 }
 
+/// Pixel rows per thread of the rasterize kernels for software adapters: many, because each read of a splat
+/// takes long.
+const ROWS: u32 = 8;
+/// Threads of a tile in these kernels.
+pub(super) const SOFTWARE_THREADS: u32 = TILE * TILE / 4 / ROWS;
+
 /// As bin_sort_wide.wgsl has it.
-const _: () = assert!(Build::ALL[0].segments == 256 && SUM_SETS * SUM_ROWS <= 256);
+const _: () = assert!(Build::Gpu.segments() == 256 && SUM_SETS * SUM_ROWS <= 256);
 
 impl Build {
-    /// For GPUs, and for software adapters with and without subgroups of a tile's threads.
-    pub const ALL: [Self; 3] = [
-        Self {
-            for_gpus: true,
-            rows: 8,
-            subgroups: false,
-            digit_bits: 8,
-            loss_by_lines: false,
-            segments: 256,
-        },
-        Self {
-            for_gpus: false,
-            rows: 8,
-            subgroups: true,
-            digit_bits: 4,
-            loss_by_lines: true,
-            segments: 16,
-        },
-        Self {
-            for_gpus: false,
-            rows: 8,
-            subgroups: false,
-            digit_bits: 4,
-            loss_by_lines: true,
-            segments: 16,
-        },
-    ];
+    pub const ALL: [Self; 3] = [Self::Gpu, Self::SoftwareSubgroups, Self::Software];
 
-    pub const fn threads(self) -> u32 {
-        TILE * TILE / 4 / self.rows
+    pub const fn is_gpu(self) -> bool {
+        matches!(self, Self::Gpu)
+    }
+
+    pub const fn subgroups(self) -> bool {
+        matches!(self, Self::SoftwareSubgroups)
+    }
+
+    /// Bits that a pass of the sort takes.
+    pub const fn digit_bits(self) -> u32 {
+        if self.is_gpu() { 8 } else { 4 }
+    }
+
+    /// Workgroups per scan or sort: a few per core on a CPU, many on a GPU.
+    pub const fn segments(self) -> u32 {
+        if self.is_gpu() { 256 } else { 16 }
     }
 }
 
@@ -93,7 +79,7 @@ pub(super) struct Source {
 
 /// WGSL declarations such as `Splat2d`, for callers that draw from the kernels' buffers.
 pub fn shared_wgsl() -> String {
-    constants(1) + SHARED
+    constants() + SHARED
 }
 
 /// Every source once.
@@ -123,22 +109,22 @@ pub fn shader_variants() -> impl Iterator<Item = ShaderVariant> {
             name: format!(
                 "{}, {}{}",
                 source.name,
-                if build.for_gpus { "GPUs" } else { "software" },
-                if build.subgroups { ", subgroups" } else { "" }
+                if build.is_gpu() { "GPUs" } else { "software" },
+                if build.subgroups() { ", subgroups" } else { "" }
             ),
             text: source.text(build),
-            subgroups: build.subgroups,
+            subgroups: build.subgroups(),
             constants: source.constants(build),
         })
     })
 }
 
-/// Repeats every line that contains `{row}` once for each of `rows` rows.
-fn repeat_rows(text: &str, rows: u32) -> String {
+/// Repeats every line that contains `{row}` once for each of [`ROWS`].
+fn repeat_rows(text: &str) -> String {
     let mut out = String::with_capacity(2 * text.len());
     for line in text.split_inclusive('\n') {
         if line.contains("{row}") && !line.trim_start().starts_with("//") {
-            (0..rows).for_each(|row| out.push_str(&line.replace("{row}", &row.to_string())));
+            (0..ROWS).for_each(|row| out.push_str(&line.replace("{row}", &row.to_string())));
         } else {
             out.push_str(line);
         }
@@ -168,19 +154,19 @@ impl Source {
     }
 
     pub fn text(&self, build: Build) -> String {
-        let mut text = constants(build.rows);
-        let gpu_parts = self.gpu_parts.filter(|_| build.for_gpus);
+        let mut text = constants();
+        let gpu_parts = self.gpu_parts.filter(|_| build.is_gpu());
         if let (Some(texts), None) = (self.tile_work, gpu_parts) {
-            text.push_str(texts[usize::from(build.subgroups)]);
+            text.push_str(texts[usize::from(build.subgroups())]);
         }
-        text.push_str(&repeat_rows(SHARED, build.rows));
+        text.push_str(SHARED);
         for part in gpu_parts.unwrap_or(self.parts) {
-            text.push_str(&repeat_rows(part, build.rows));
+            text.push_str(&repeat_rows(part));
         }
         text
     }
 
     pub fn constants(&self, build: Build) -> Vec<(&'static str, f64)> {
-        if self.segmented { vec![("SEGMENTS", f64::from(build.segments))] } else { Vec::new() }
+        if self.segmented { vec![("SEGMENTS", f64::from(build.segments()))] } else { Vec::new() }
     }
 }

@@ -105,6 +105,7 @@ const SORT_KEYS: &str = include_str!("../shaders/bin_sort_keys.wgsl");
 const SORT_BINDINGS: [Access; 7] =
     [Uniform, ReadWrite, Read, Read, ReadWrite, ReadWrite, ReadWrite];
 const BIN_TILES: &str = include_str!("../shaders/bin_tiles.wgsl");
+const TILE_LIST: &str = include_str!("../shaders/tile_list.wgsl");
 const TILE_BLOCKS: &str = include_str!("../shaders/tile_blocks.wgsl");
 const BACKWARD: &str = include_str!("../shaders/rasterize_backward.wgsl");
 const BACKWARD_BLOCKS: &str = include_str!("../shaders/rasterize_backward_blocks.wgsl");
@@ -283,24 +284,32 @@ static BIN_RANGES: Source = Source::new(
 
 static RASTERIZE: Source = Source::new(
     "rasterize",
-    &[include_str!("../shaders/rasterize.wgsl")],
+    &[TILE_LIST, include_str!("../shaders/rasterize.wgsl")],
     &[Uniform, Uniform, Read, Read, Read, ReadWrite, ReadWrite],
 )
 .with_tile_work(TILE_WORK)
-.with_gpu_parts(&[BIN_TILES, TILE_BLOCKS, include_str!("../shaders/rasterize_blocks.wgsl")]);
+.with_gpu_parts(&[
+    TILE_LIST,
+    BIN_TILES,
+    TILE_BLOCKS,
+    include_str!("../shaders/rasterize_blocks.wgsl"),
+]);
 
-static RASTERIZE_BACKWARD: Source =
-    Source::new("rasterize_backward", &[SIGNED, BACKWARD_PIXELS, BACKWARD], &BACKWARD_BINDINGS)
-        .with_tile_work(TILE_SUMS)
-        .with_gpu_parts(&[SIGNED, BACKWARD_PIXELS, BIN_TILES, TILE_BLOCKS, BACKWARD_BLOCKS]);
-
-static RASTERIZE_BACKWARD_ABSOLUTE: Source = Source::new(
-    "rasterize_backward_absolute",
-    &[ABSOLUTE, BACKWARD_PIXELS, BACKWARD],
+static RASTERIZE_BACKWARD: Source = Source::new(
+    "rasterize_backward",
+    &[SIGNED, BACKWARD_PIXELS, TILE_LIST, BACKWARD],
     &BACKWARD_BINDINGS,
 )
 .with_tile_work(TILE_SUMS)
-.with_gpu_parts(&[ABSOLUTE, BACKWARD_PIXELS, BIN_TILES, TILE_BLOCKS, BACKWARD_BLOCKS]);
+.with_gpu_parts(&[SIGNED, BACKWARD_PIXELS, TILE_LIST, BIN_TILES, TILE_BLOCKS, BACKWARD_BLOCKS]);
+
+static RASTERIZE_BACKWARD_ABSOLUTE: Source = Source::new(
+    "rasterize_backward_absolute",
+    &[ABSOLUTE, BACKWARD_PIXELS, TILE_LIST, BACKWARD],
+    &BACKWARD_BINDINGS,
+)
+.with_tile_work(TILE_SUMS)
+.with_gpu_parts(&[ABSOLUTE, BACKWARD_PIXELS, TILE_LIST, BIN_TILES, TILE_BLOCKS, BACKWARD_BLOCKS]);
 
 static RASTERIZE_BACKWARD_SUM: Source =
     Source::new("rasterize_backward_sum", &[SIGNED, BACKWARD_SUM], &BACKWARD_SUM_BINDINGS);

@@ -12,7 +12,7 @@ use crate::gpu::mcmc::Run;
 use crate::gpu::original::RunUniform;
 
 fn parse(source: &Source) -> naga::Module {
-    let text = source.text(Build::ALL[0]);
+    let text = source.text(Build::Gpu);
     naga::front::wgsl::parse_str(&text)
         .unwrap_or_else(|e| panic!("{}: {}", source.name, e.emit_to_string(&text)))
 }

@@ -5,7 +5,7 @@
 const SPLATS = 64u;
 // Most coefficients of one degree, and floats of them.
 const WIDEST = 9u;
-const STRIDE = 27u;
+const STRIDE = 3u * WIDEST;
 
 // Number of degrees to update, 0 if no splat is drawn.
 var<workgroup> degrees: u32;

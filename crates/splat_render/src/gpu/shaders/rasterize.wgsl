@@ -1,6 +1,6 @@
 // rasterize: every tile's splats, front to back, to colors, depth and final transmittance. A
 // thread owns four neighboring pixels of each of ROWS rows, so that a splat is read once for all of
-// them. Follows shared.wgsl and tile_memory.wgsl or tile_subgroup.wgsl.
+// them. Follows shared.wgsl, tile_list.wgsl and tile_memory.wgsl or tile_subgroup.wgsl.
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> chunk: Chunk;
@@ -106,18 +106,13 @@ fn rasterize(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) thread: u32,
 ) {
-    let relative = workgroup.y * groups.x + workgroup.x;
-    let tile = chunk.tile_begin + relative;
-    if tile >= chunk.tile_end {
+    let list = tile_list(workgroup, groups);
+    if !list.exists {
         return;
     }
-    let list = tile_begin[relative];
-    let length = tile_begin[relative + 1u] - list;
-    if chunk.list_begin > 0u && chunk.list_begin >= length {
-        return;
-    }
-    let end = list + min(chunk.list_end, length);
-    let goes_on = length > chunk.list_end;
+    let tile = list.tile;
+    let end = list.end;
+    let goes_on = list.goes_on;
     let x = (tile % view.tiles_x) * TILE + 4u * (thread % 4u);
     let y = (tile / view.tiles_x) * TILE + ROWS * (thread / 4u);
     let center_x = f32(x) + vec4(0.5, 1.5, 2.5, 3.5);
@@ -126,7 +121,7 @@ fn rasterize(
     // an array of rows is not unrolled by every driver, and then lives in memory.
     var quad{row} = start(x, y + {row}u);
     var walking = true;
-    for (var batch = list + chunk.list_begin; walking && batch < end; batch += AHEAD) {
+    for (var batch = list.begin; walking && batch < end; batch += AHEAD) {
         let ahead = read_ahead(batch, end, thread);
         for (var k = 0u; k < AHEAD && batch + k < end; k++) {
             let splat = splat_of(ahead, k);

@@ -1,7 +1,7 @@
 // rasterize_backward: gradients of the picture to a gradient per (splat, tile) pair, each in a separate
 // slot. Walks front to back like rasterize, so that both round and stop alike; the light behind the
-// current splat is the pixel's total minus the light so far. Follows shared.wgsl, backward_pixels.wgsl and
-// tile_memory.wgsl with tile_sums_memory.wgsl, or their variants for subgroups.
+// current splat is the pixel's total minus the light so far. Follows shared.wgsl, backward_pixels.wgsl,
+// tile_list.wgsl and tile_memory.wgsl with tile_sums_memory.wgsl, or their variants for subgroups.
 
 // In one row: llvmpipe fills its vectors along x alone.
 const THREADS = 64u / ROWS;
@@ -122,18 +122,13 @@ fn rasterize_backward(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) thread: u32,
 ) {
-    let relative = workgroup.y * groups.x + workgroup.x;
-    let tile = chunk.tile_begin + relative;
-    if tile >= chunk.tile_end {
+    let list = tile_list(workgroup, groups);
+    if !list.exists {
         return;
     }
-    let list = tile_begin[relative];
-    let length = tile_begin[relative + 1u] - list;
-    if chunk.list_begin > 0u && chunk.list_begin >= length {
-        return;
-    }
-    let begin = list + chunk.list_begin;
-    let end = list + min(chunk.list_end, length);
+    let tile = list.tile;
+    let begin = list.begin;
+    let end = list.end;
     let x = (tile % view.tiles_x) * TILE + 4u * (thread % 4u);
     let y = (tile / view.tiles_x) * TILE + ROWS * (thread / 4u);
     // A line with {row} stands once for each of the thread's rows, as in rasterize.
@@ -174,9 +169,9 @@ fn rasterize_backward(
     // Slots after the tile's early stop and, for the last tile, after all tiles.
     write_zeros(written, end, thread);
     if tile + 1u == chunk.tile_end && chunk.list_begin == 0u {
-        write_zeros(tile_begin[relative + 1u], tile_begin[relative + 2u], thread);
+        write_zeros(tile_begin[list.index + 1u], tile_begin[list.index + 2u], thread);
     }
-    if length > chunk.list_end {
+    if list.goes_on {
         keep(quad{row}, x, y + {row}u);
     }
 }

@@ -1,7 +1,7 @@
 // rasterize_backward for GPUs: as rasterize_backward.wgsl, with threads in two roles. For ITEMS splats at a
 // time, a thread first walks them for its pixel and leaves two numbers each; then it adds up four pixels
-// of one splat. Sums have a fixed order. Follows shared.wgsl, backward_pixels.wgsl, bin_tiles.wgsl and
-// tile_blocks.wgsl.
+// of one splat. Sums have a fixed order. Follows shared.wgsl, backward_pixels.wgsl, tile_list.wgsl,
+// bin_tiles.wgsl and tile_blocks.wgsl.
 
 const BATCH = 32u;
 const ITEMS = 4u;
@@ -77,18 +77,13 @@ fn rasterize_backward(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) thread: u32,
 ) {
-    let relative = workgroup.y * groups.x + workgroup.x;
-    let tile = chunk.tile_begin + relative;
-    if tile >= chunk.tile_end {
+    let list = tile_list(workgroup, groups);
+    if !list.exists {
         return;
     }
-    let list = tile_begin[relative];
-    let length = tile_begin[relative + 1u] - list;
-    if chunk.list_begin > 0u && chunk.list_begin >= length {
-        return;
-    }
-    let begin = list + chunk.list_begin;
-    let end = list + min(chunk.list_end, length);
+    let tile = list.tile;
+    let begin = list.begin;
+    let end = list.end;
     let block = thread / 32u;
     let lane = thread % 32u;
     let corner = block_corner(tile, block);
@@ -220,9 +215,9 @@ fn rasterize_backward(
     // Slots after the tile's early stop and, for the last tile, after all tiles.
     write_zeros(written, end, thread);
     if tile + 1u == chunk.tile_end && chunk.list_begin == 0u {
-        write_zeros(tile_begin[relative + 1u], tile_begin[relative + 2u], thread);
+        write_zeros(tile_begin[list.index + 1u], tile_begin[list.index + 2u], thread);
     }
-    if length > chunk.list_end && index != 0xffffffffu {
+    if list.goes_on && index != 0xffffffffu {
         totals[index] = pixel.remaining;
         transmittances[index] = select(-pixel.transmittance, pixel.transmittance, pixel.live);
     }

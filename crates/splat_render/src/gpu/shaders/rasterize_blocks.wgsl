@@ -1,5 +1,5 @@
 // rasterize for GPUs: as rasterize.wgsl, with the same bits, one pixel per thread. Follows shared.wgsl,
-// bin_tiles.wgsl and tile_blocks.wgsl.
+// tile_list.wgsl, bin_tiles.wgsl and tile_blocks.wgsl.
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> chunk: Chunk;
@@ -20,17 +20,12 @@ fn rasterize(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) thread: u32,
 ) {
-    let relative = workgroup.y * groups.x + workgroup.x;
-    let tile = chunk.tile_begin + relative;
-    if tile >= chunk.tile_end {
+    let list = tile_list(workgroup, groups);
+    if !list.exists {
         return;
     }
-    let list = tile_begin[relative];
-    let length = tile_begin[relative + 1u] - list;
-    if chunk.list_begin > 0u && chunk.list_begin >= length {
-        return;
-    }
-    let end = list + min(chunk.list_end, length);
+    let tile = list.tile;
+    let end = list.end;
     let block = thread / 32u;
     let at = block_corner(tile, block) + vec2(thread % 8u, thread / 8u % 4u);
     let exists = all(at < vec2(view.width, view.height));
@@ -51,7 +46,7 @@ fn rasterize(
     clear_touched(0u, thread);
     workgroupBarrier();
     var odd = 0u;
-    for (var batch = list + chunk.list_begin; batch < end; batch += BATCH) {
+    for (var batch = list.begin; batch < end; batch += BATCH) {
         if thread == 0u {
             any_live = 0u;
         }
@@ -90,7 +85,7 @@ fn rasterize(
         }
     }
     if exists {
-        let goes_on = length > chunk.list_end;
+        let goes_on = list.goes_on;
         if goes_on {
             transmittance = select(-transmittance, transmittance, live);
         } else {
