@@ -16,6 +16,8 @@ fn size(shader: &Compiled) -> [usize; 3] {
         BoundsCheckPolicies { index: none, buffer: none, image_load: none, binding_array: none };
     let options = spv::Options {
         lang_version: (1, 0),
+        // Names of variables are instructions too; a debug build would write and count them.
+        flags: spv::WriterFlags::empty(),
         bounds_check_policies: policies,
         zero_initialize_workgroup_memory: spv::ZeroInitializeWorkgroupMemoryMode::None,
         force_loop_bounding: false,
