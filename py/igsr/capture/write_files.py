@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
 
@@ -24,20 +24,30 @@ def relative_name(name: str) -> PurePosixPath:
     return PurePosixPath(*parts) if parts else PurePosixPath("view")
 
 
+def unique_stems(names: Iterable[str], *suffixes: str) -> list[str]:
+    """Return a path for each view's name; with any of the suffixes, it names no other view's file.
+
+    Upper and lower case are the same to some file systems.
+    """
+    taken: set[str] = set()
+    stems: list[str] = []
+    for name in names:
+        path = relative_name(name)
+        stem, longer = path.with_suffix("").as_posix(), path.as_posix()
+        while not taken.isdisjoint(files := {(stem + end).casefold() for end in suffixes}):
+            stem, longer = longer, f"{longer}_"
+        taken |= files
+        stems.append(stem)
+    return stems
+
+
 def png_names(views: list[View]) -> list[str]:
     """Return a unique ``.png`` name for each view, without a leading ``images/``."""
-    names: list[str] = []
+    names = []
     for view in views:
-        path = relative_name(view.name)
-        if len(path.parts) > 1 and path.parts[0] == "images":
-            path = path.relative_to("images")
-        name = path.with_suffix(".png").as_posix()
-        if name in names:
-            name = f"{path.as_posix()}.png"
-        while name in names:
-            name = f"{name[:-4]}_.png"
-        names.append(name)
-    return names
+        first, *rest = (path := relative_name(view.name)).parts
+        names.append("/".join(rest) if rest and first == "images" else path.as_posix())
+    return [f"{stem}.png" for stem in unique_stems(names, ".png")]
 
 
 def write_pictures(

@@ -15,7 +15,6 @@ from igsr.cli.options import (
     SplitName,
     load,
     option,
-    picture_name,
     resolved,
 )
 from igsr.cli.output import output_console, print_json
@@ -44,6 +43,7 @@ def denoise_command(
     from PIL import Image
 
     from igsr._internal.atomic_write import atomic_write
+    from igsr.capture.write_files import unique_stems
     from igsr.denoiser import (
         NetworkDenoiser,
         denoise,
@@ -73,7 +73,9 @@ def denoise_command(
         support = photo_support(splats, photos, name)
         sources = photo_sources(splats, photos, background, name)
         files = []
-        for view in views:
+        ends = (".png", ".confidence.png")
+        stems = unique_stems((view.name for view in views), *ends)
+        for view, stem in zip(views, stems, strict=True):
             buffers = render_buffers(splats, view.camera, support, known, name)
             others = [
                 source
@@ -81,9 +83,8 @@ def denoise_command(
                 if photo.name != view.name
             ]
             picture, confidence = denoise(buffers, others, denoiser)
-            path = out / picture_name(view.name, ".png")
-            path.parent.mkdir(parents=True, exist_ok=True)
-            for array, file in ((picture, path), (confidence, path.with_suffix(".confidence.png"))):
+            for array, end in zip((picture, confidence), ends, strict=True):
+                file = out / f"{stem}{end}"
                 with atomic_write(file) as temporary:
                     pixels = np.rint(255.0 * array).astype(np.uint8)
                     Image.fromarray(pixels).save(temporary, format="PNG")

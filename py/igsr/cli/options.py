@@ -192,10 +192,3 @@ def estimator_options(checkpoint: Path | None, matcher: str | None) -> dict[str,
     """The options of the camera estimator that were given."""
     given = {"checkpoint": checkpoint, "matcher": matcher}
     return {name: value for name, value in given.items() if value is not None}
-
-
-def picture_name(view_name: str, suffix: str) -> Path:
-    """A view's name with another suffix, as a relative path that stays inside its folder."""
-    from igsr.capture.write_files import relative_name
-
-    return Path(relative_name(view_name)).with_suffix(suffix)

@@ -22,7 +22,6 @@ from igsr.cli.options import (
     SceneArgument,
     background_color,
     option,
-    picture_name,
     resolved,
 )
 from igsr.cli.output import output_console, print_json
@@ -135,12 +134,12 @@ def _write_pictures(
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
 
+    from igsr.capture.write_files import unique_stems
+
     suffix = ".exr" if exr else ".png"
-    files: list[Path] = []
-    for view in views:
-        path = out / picture_name(view.name, suffix)
-        if path in files:
-            path = out / picture_name(view.name + suffix, suffix)
+    stems = unique_stems((view.name for view in views), suffix)
+    files = [out / f"{stem}{suffix}" for stem in stems]
+    for view, path in zip(views, files, strict=True):
         picture = render(splats, view.camera, background, backend)
         with atomic_write(path) as temporary:
             if exr:
@@ -151,5 +150,4 @@ def _write_pictures(
                 tag = PngInfo()
                 tag.add_text("Software", OWN_TAG)
                 Image.fromarray(picture.to_uint8()).save(temporary, format="PNG", pnginfo=tag)
-        files.append(path)
     return files
