@@ -208,7 +208,10 @@ signals = pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids
 
 
 def signal_when(ready, number, *arguments):
-    """Start a command, send it a signal once ``ready(its process)`` is true, and return its end."""
+    """Start a command, send it a signal once ``ready(its process)`` is true, and return its end.
+
+    The signal is sent repeatedly, as by ``timeout`` and ``uv run``.
+    """
     process = subprocess.Popen(
         [*COMMAND, *map(str, arguments)],
         stdout=subprocess.PIPE,
@@ -222,9 +225,13 @@ def signal_when(ready, number, *arguments):
         assert process.poll() is None, process.communicate()
         assert time.monotonic() < deadline
         time.sleep(0.02)
-    process.send_signal(number)
+    for _ in range(6):
+        process.send_signal(number)
+        time.sleep(0.005)
     stdout, stderr = process.communicate(timeout=60)
-    return subprocess.CompletedProcess([], process.returncode, stdout, stderr)
+    code = process.returncode
+    # Exit codes as in shells: a further signal can end the interpreter while it shuts down.
+    return subprocess.CompletedProcess([], code if code >= 0 else 128 - code, stdout, stderr)
 
 
 @pytest.fixture(scope="module")
@@ -264,6 +271,43 @@ def test_a_signal_while_cameras_are_sought_is_one_sentence(tmp_path, number, mon
     ended = signal_when(has_begun, number, "fit", photos, "--out", tmp_path / "out", "--json")
     assert_fails(ended, "Interrupted before the first step", code=128 + number)
     assert not (tmp_path / "out/cameras.npz").exists()
+
+
+@pytest.mark.parametrize(
+    ("command", "begun", "said"),
+    [
+        (["convert", "{scene}", "{out}/levels", "--lod", 3], "out/.*/new/*", "nothing is written"),
+        (["convert", "{scene}", "{out}/a.html"], "temporary/*", "nothing is written"),
+        (["view", "--web", "{scene}", "--cameras", "{capture}"], "temporary/*", "Interrupted"),
+    ],
+    ids=lambda given: given[0] if isinstance(given, list) else "",
+)
+def test_a_signal_leaves_no_temporary_files(
+    capture_path, tmp_path, command, begun, said, monkeypatch
+):
+    """Folders of poses and fits are in the tests above."""
+    places = {name: tmp_path / name for name in ("out", "temporary")}
+    for folder in places.values():
+        folder.mkdir()
+    monkeypatch.setenv("TMPDIR", str(places["temporary"]))
+    scene = tmp_path / "scene.ply"
+    scenes.splats(count=200_000).save(scene)
+    words = [str(word).format(scene=scene, capture=capture_path, **places) for word in command]
+    ended = signal_when(lambda _: any(tmp_path.glob(begun)), signal.SIGTERM, *words)
+    assert ended.returncode == 128 + signal.SIGTERM
+    assert said in ended.stderr.splitlines()[-1]
+    assert not any(any(folder.iterdir()) for folder in places.values())
+
+
+def test_a_signal_in_the_first_use_of_numpy_by_the_renderer_is_no_panic(tmp_path):
+    scenes.splats().save(tmp_path / "scene.ply")
+    code = f"""
+import igsr._core, numpy.lib
+numpy.lib.NumpyVersion = None  # as an exception raised in it
+igsr.Splats.load({str(tmp_path / "scene.ply")!r})
+"""
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (ended.returncode, ended.stderr) == (0, "")
 
 
 @pytest.mark.parametrize("moment", ["during", "after"])

@@ -35,6 +35,9 @@ mod _core {
     const __version__: &str = env!("CARGO_PKG_VERSION");
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
+        // Its first use runs Python code, in which a signal would be a panic.
+        module.py().import("numpy")?;
+        numpy::PyArray1::<f32>::zeros(module.py(), 0, false);
         module.add("NEAR_PLANE", constants::NEAR)?;
         module.add("FAR_PLANE", constants::FAR)?;
         module.add("EPS2D", constants::BLUR)?;

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from igsr import _core
 from igsr._internal.atomic_write import check_writable
-from igsr.cli.error_messages import error_messages, print_message
+from igsr.cli.error_messages import error_messages, nothing_written, print_message
 from igsr.cli.options import (
     BackendOption,
     BackgroundOption,
@@ -61,9 +61,9 @@ def clean_command(
     from igsr.evaluation.scores import default_background
     from igsr.floaters import remove_floaters
 
-    with error_messages(lambda: "Interrupted; nothing is written."):
+    target = scene.with_name(f"{scene.name.split('.')[0]}.clean.ply") if out is None else out
+    with error_messages(nothing_written(target)):
         name = resolved(backend)
-        target = scene.with_name(f"{scene.name.split('.')[0]}.clean.ply") if out is None else out
         splats = Splats.load(scene)
         capture, held_out = None, None
         if capture_path is not None:

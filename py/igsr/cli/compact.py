@@ -10,7 +10,7 @@ from typing import Annotated
 from igsr._internal.atomic_write import check_writable
 from igsr._internal.json_file import write_json
 from igsr._internal.progress_bar import progress_bar
-from igsr.cli.error_messages import error_messages
+from igsr.cli.error_messages import error_messages, nothing_written
 from igsr.cli.options import (
     BackgroundOption,
     FitBackendOption,
@@ -79,10 +79,10 @@ def compact_command(
     as_json: JsonOption = False,
 ) -> None:
     """Reduce SCENE to the fewest splats that lose at most --max-loss of PSNR."""
-    with error_messages(lambda: "Interrupted; nothing is written."):
+    target = scene.with_suffix(".compact.ply") if out is None else out
+    with error_messages(nothing_written(target)):
         name = resolved(backend)
         limit = _decibels("--max-loss", max_loss)
-        target = scene.with_suffix(".compact.ply") if out is None else out
         if target.suffix.lower() != ".ply":
             raise IgsrError(f"--out {target} must be a .ply file.")
         splats = Splats.load(scene)

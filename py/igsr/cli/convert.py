@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from igsr._internal.atomic_write import check_folder, check_writable
-from igsr.cli.error_messages import error_messages, print_message
+from igsr.cli.error_messages import error_messages, nothing_written, print_message
 from igsr.cli.options import Color, JsonOption, background_color, option
 from igsr.cli.output import output_console, print_json
 from igsr.errors import IgsrError
@@ -63,7 +63,7 @@ def convert_command(
 
     Says what the format cannot hold. Captures are written with undistorted photos and masks.
     """
-    with error_messages(lambda: "Interrupted; nothing is written."):
+    with error_messages(nothing_written(target)):
         if source.suffix.lower() not in SPLAT_ENDINGS:
             report = _converted_capture(source, target, to)
             lines = [f"{report['views']} views in {target}"]

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import signal
 import sys
 import threading
+import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import FrameType
 
 import typer
@@ -20,6 +23,10 @@ from igsr.errors import IgsrError
 INTERRUPTED = 130
 TERMINATED = 143
 
+#: Seconds after a signal in which further ones are ignored. ``timeout`` and ``uv run`` send two.
+REPEATS_S = 2.0
+_raised_at = -math.inf
+
 #: Environment variable that asks for the traceback behind an error message. ``igsr --debug`` sets
 #: it, so that worker processes see it too.
 DEBUG_VARIABLE = "IGSR_DEBUG"
@@ -27,6 +34,19 @@ DEBUG_VARIABLE = "IGSR_DEBUG"
 
 class Terminated(KeyboardInterrupt):
     """SIGTERM, which ends a command as Ctrl-C does."""
+
+
+def nothing_written(target: Path) -> Callable[[], str]:
+    """The message after an interruption: that ``target`` is not written, or that it is."""
+
+    def state() -> tuple[int, int] | None:
+        with contextlib.suppress(OSError):
+            found = target.stat()
+            return found.st_ino, found.st_mtime_ns
+        return None
+
+    before = state()
+    return lambda: f"Interrupted; {'nothing' if state() == before else target} is written."
 
 
 def debugging() -> bool:
@@ -49,7 +69,7 @@ def error_messages(interrupted: Callable[[], str] = lambda: "Interrupted.") -> I
         typer.Exit: with status 1, ``INTERRUPTED`` or ``TERMINATED``.
     """
     try:
-        with _sigterm_raises(), warnings.catch_warnings():
+        with _signals_raise(), warnings.catch_warnings():
             warnings.showwarning = lambda message, *rest: print_message(str(message))
             yield
     except typer.Exit:  # a RuntimeError
@@ -71,20 +91,32 @@ def error_messages(interrupted: Callable[[], str] = lambda: "Interrupted.") -> I
 
 
 @contextlib.contextmanager
-def _sigterm_raises() -> Iterator[None]:
-    """Raise ``Terminated`` when the process gets SIGTERM."""
+def _signals_raise() -> Iterator[None]:
+    """Raise ``KeyboardInterrupt`` or ``Terminated`` when the process gets a signal to end."""
     if threading.current_thread() is not threading.main_thread():
         yield  # Python handles signals in the main thread only
         return
-
-    def terminate(number: int, frame: FrameType | None) -> None:
-        raise Terminated
-
-    before = signal.signal(signal.SIGTERM, terminate)
+    defaults = (signal.SIG_DFL, signal.default_int_handler)
+    signals = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.getsignal(number) for number in signals}
+    replaced = {number: handler for number, handler in before.items() if handler in defaults}
+    for number in replaced:
+        signal.signal(number, _raise)
+    started_at = time.monotonic()
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL if before is None else before)
+        if _raised_at < started_at:  # else the process is about to end
+            for number, handler in replaced.items():
+                signal.signal(number, handler)
+
+
+def _raise(number: int, frame: FrameType | None) -> None:
+    global _raised_at
+    now = time.monotonic()
+    if now - _raised_at > REPEATS_S:
+        _raised_at = now
+        raise Terminated if number == signal.SIGTERM else KeyboardInterrupt
 
 
 def print_message(message: str) -> None:

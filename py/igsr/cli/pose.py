@@ -13,7 +13,7 @@ from igsr._internal.atomic_write import check_folder
 from igsr._internal.progress_bar import progress_bar
 from igsr.capture.load import holds_cameras
 from igsr.capture.photo_folder import FRAMES
-from igsr.cli.error_messages import error_messages, print_message
+from igsr.cli.error_messages import error_messages, nothing_written, print_message
 from igsr.cli.options import (
     CheckpointOption,
     EstimatorOption,
@@ -59,7 +59,7 @@ def pose_command(
     as_json: JsonOption = False,
 ) -> None:
     """Find the cameras of PHOTOS; write photos and cameras as a COLMAP capture."""
-    with error_messages(lambda: "Interrupted; nothing is written."):
+    with error_messages(nothing_written(out)):
         check_folder(out)
         given = photos[0] if len(photos) == 1 else photos
         if estimator == "auto" and isinstance(given, Path) and holds_cameras(given):
