@@ -84,6 +84,6 @@ def test_folders_that_stay_empty_are_removed(tmp_path):
 
 
 def test_a_file_system_without_locks(tmp_path, monkeypatch):
-    monkeypatch.setattr("igsr._internal.folder_lock._try_lock", lambda file: None)
+    monkeypatch.setattr("igsr._internal.folder_lock.try_lock", lambda file: None)
     with folder_lock(tmp_path), folder_lock(tmp_path):
         pass

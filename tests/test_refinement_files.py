@@ -126,9 +126,9 @@ def test_killed_between_two_files_and_resumed_it_ends_the_same(
     with pytest.raises(KeyboardInterrupt):
         refine(few_photos, 2, truthful, out=tmp_path)
     monkeypatch.setattr(os, "replace", replace)
-    unfinished = tmp_path / "checkpoints/.whole-1.unfinished.npz"
-    unfinished.parent.mkdir(exist_ok=True)
-    unfinished.write_bytes(b"by a process that was killed")
+    unfinished = tmp_path / ".report.json-0000.unfinished"
+    unfinished.mkdir()
+    (unfinished / "new.json").write_bytes(b"by a process that was killed")
     refined = refine(few_photos, 2, truthful, out=tmp_path, resume=True)
     assert same(refined.splats, helped[0].splats)
     assert files_in(tmp_path).keys() == files_in(helped[1]).keys()

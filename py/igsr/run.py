@@ -43,6 +43,8 @@ class Run:
         """
         if resume and out is None:
             raise IgsrError("resume needs out, the folder of the run to continue.")
+        if out == "":
+            raise IgsrError("out is empty; name a folder.")
         self.out = None if out is None else Path(out)
         if self.out is not None:
             existing = next((p for p in (self.out, *self.out.parents) if p.exists()), None)

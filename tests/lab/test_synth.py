@@ -1,7 +1,6 @@
 """Synthetic captures: same seed, same bits; cameras, depths and masks agree."""
 
 import json
-import os
 import shutil
 import sys
 from pathlib import Path
@@ -146,9 +145,9 @@ def test_parallel_scenes_have_the_same_bits(made, tmp_path):
 def test_finished_scenes_are_kept_and_unfinished_ones_removed(lone):
     before = files(lone)
     # As left by a killed process.
-    unfinished = lone / f".scene_{OTHER:05d}.{2**30}.unfinished"
-    (unfinished / "train").mkdir(parents=True)
-    (unfinished / "train" / "099.png").write_bytes(b"half")
+    unfinished = lone / f".scene_{OTHER:05d}-0000.unfinished"
+    (unfinished / "new/train").mkdir(parents=True)
+    (unfinished / "new/train/099.png").write_bytes(b"half")
     seen = []
     report = synthesize(
         lone, 2, first=OTHER, settings=SMALL, on_scene=lambda *row: seen.append(row)
@@ -182,9 +181,7 @@ def test_scenes_made_on_ray_are_the_same(made, tmp_path, monkeypatch):
 
 
 def test_two_processes_can_make_one_scene(tmp_path, monkeypatch):
-    # Another process is half through, and then the first to finish.
-    others = tmp_path / f".scene_{LONE:05d}.{os.getppid()}.unfinished"
-    (others / "train").mkdir(parents=True)
+    # Another process is the first to finish.
     real = captures._photograph
 
     def overtaken(folder, *rest):
@@ -195,8 +192,7 @@ def test_two_processes_can_make_one_scene(tmp_path, monkeypatch):
 
     monkeypatch.setattr(captures, "_photograph", overtaken)
     synthesize(tmp_path, 1, first=LONE, settings=SMALL)
-    assert sorted(path.name for path in tmp_path.iterdir()) == [others.name, f"scene_{LONE:05d}"]
-    assert (others / "train").is_dir()
+    assert sorted(path.name for path in tmp_path.iterdir()) == [f"scene_{LONE:05d}"]
     assert len(load_capture(scene(tmp_path, LONE)).train_views) == 3
 
 

@@ -38,6 +38,8 @@ impl Error {
 
     /// An [`Error::File`] in one call.
     pub fn file(path: impl AsRef<std::path::Path>, reason: impl Into<String>) -> Self {
-        Self::File { path: path.as_ref().display().to_string(), reason: reason.into() }
+        let named = path.as_ref().display().to_string();
+        let path = if named.is_empty() { r#""""#.to_owned() } else { named };
+        Self::File { path, reason: reason.into() }
     }
 }

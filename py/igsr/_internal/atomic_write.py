@@ -6,20 +6,26 @@ New content goes to a temporary name in the same folder, which is renamed when i
 from __future__ import annotations
 
 import contextlib
+import glob
 import os
 import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from igsr._internal.folder_lock import try_lock
 from igsr.errors import IgsrError
+
+#: Name of a folder in the temporary folder that replaces it.
+OLD = "old"
 
 
 @contextlib.contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a temporary path that replaces ``path`` on success and is deleted on failure.
+    """Yield an empty temporary file that replaces ``path`` on success and is deleted on failure.
 
-    It has the suffix of ``path``, by which image and video writers choose their format.
+    It has the suffix of ``path``, by which image and video writers choose their format. An older
+    file's mode is kept.
 
     Args:
         path: file to write. Its folder is created if it is missing.
@@ -27,30 +33,17 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     Raises:
         IgsrError: the file cannot be written; an older file stays.
     """
-    target = Path(path)
-    temporary: Path | None = None
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(
-            prefix=f".{target.stem}-", suffix=f".unfinished{target.suffix}", dir=target.parent
-        )
-        os.close(handle)
-        temporary = Path(name)
-        yield temporary
-        # mkstemp makes files private.
-        os.chmod(temporary, 0o666 & ~_umask())
-        with open(temporary, "rb") as written:
+    target = _named(path)
+    with _unfinished(target) as folder:
+        new = folder / f"new{target.suffix}"
+        new.touch()
+        yield new
+        if target.is_file() and not target.is_symlink():
+            shutil.copymode(target, new)
+        with open(new, "rb") as written:
             # Without this, the file can be empty after a power failure.
             os.fsync(written.fileno())
-        os.replace(temporary, target)
-        temporary = None
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise IgsrError(f"Cannot write {target}: {reason}.") from error
-    finally:
-        if temporary is not None:
-            with contextlib.suppress(OSError):
-                temporary.unlink()
+        os.replace(new, target)
 
 
 @contextlib.contextmanager
@@ -58,7 +51,7 @@ def atomic_folder(path: str | os.PathLike[str], *, replace: bool = False) -> Ite
     """Yield a temporary folder that replaces ``path`` on success and is deleted on failure.
 
     Args:
-        path: new or empty folder.
+        path: new or empty folder. Its mode is kept.
         replace: whether to replace a folder that is not empty.
 
     Raises:
@@ -66,31 +59,63 @@ def atomic_folder(path: str | os.PathLike[str], *, replace: bool = False) -> Ite
     """
     target = Path(path)
     check_folder(target, replace=replace)
-    temporary: Path | None = None
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(
-            tempfile.mkdtemp(prefix=f".{target.name}-", suffix=".unfinished", dir=target.parent)
-        )
-        new, old = temporary / "new", temporary / "old"
+    with _unfinished(target) as folder:
+        new = folder / "new"
         new.mkdir()
         yield new
         if target.exists():
-            os.rename(target, old)
+            shutil.copymode(target, new)
+            os.rename(target, folder / OLD)
         os.rename(new, target)
+
+
+@contextlib.contextmanager
+def _unfinished(target: Path) -> Iterator[Path]:
+    """Yield a private folder next to ``target``, which is removed at the end.
+
+    It is locked as long as this process lives, on systems that lock folders. Folders of killed
+    processes are removed. Rust's ``write_atomically`` uses the same names and locks.
+    """
+    prefix, suffix = f".{target.name}-", ".unfinished"
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        for left in target.parent.glob(f"{glob.escape(prefix)}*{suffix}"):
+            with _lock(left) as is_free:
+                if is_free:
+                    _remove(left, target)
+        while True:
+            folder = Path(tempfile.mkdtemp(suffix, prefix, target.parent))
+            with _lock(folder) as is_free:
+                # Another writer may have removed it before it was locked.
+                if is_free is not False and folder.exists():
+                    try:
+                        yield folder
+                    finally:
+                        _remove(folder, target)
+                    return
     except OSError as error:
-        reason = error.strerror or str(error)
-        raise IgsrError(f"Cannot write {target}: {reason}.") from error
+        raise IgsrError(f"Cannot write {target}: {error.strerror or error}.") from error
+
+
+def _remove(unfinished: Path, target: Path) -> None:
+    """Remove a folder of ``_unfinished``; an interrupted replacement of ``target`` is undone."""
+    if (unfinished / OLD).exists() and not target.exists():
+        os.rename(unfinished / OLD, target)
+    shutil.rmtree(unfinished, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def _lock(folder: Path) -> Iterator[bool | None]:
+    """Try to lock a folder; yield whether it is locked now, None if folders have no locks here."""
+    try:
+        file = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    except (OSError, AttributeError):  # Windows has no such flags
+        yield None
+        return
+    try:
+        yield try_lock(file)
     finally:
-        if temporary is not None:
-            shutil.rmtree(temporary, ignore_errors=True)
-
-
-def remove_unfinished(folder: Path) -> None:
-    """Remove temporary files that killed processes left in a folder, as far as possible."""
-    for path in folder.glob(".*.unfinished*"):
-        with contextlib.suppress(OSError):
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        os.close(file)
 
 
 def check_folder(path: str | os.PathLike[str], *, replace: bool = False) -> None:
@@ -99,7 +124,7 @@ def check_folder(path: str | os.PathLike[str], *, replace: bool = False) -> None
     Raises:
         IgsrError: the path is a file, or a folder that is not empty.
     """
-    target = Path(path)
+    target = _named(path)
     try:
         if target.exists() and not target.is_dir():
             raise IgsrError(f"Cannot write {target}: it is a file.")
@@ -115,7 +140,7 @@ def check_writable(path: str | os.PathLike[str]) -> None:
     Raises:
         IgsrError: the folder cannot be written to, or ``path`` is a folder.
     """
-    target = Path(path)
+    target = _named(path)
     if target.is_dir():
         raise IgsrError(f"Cannot write {target}: it is a folder.")
     try:
@@ -126,8 +151,8 @@ def check_writable(path: str | os.PathLike[str]) -> None:
         raise IgsrError(f"Cannot write {target}: {error.strerror or error}.") from error
 
 
-def _umask() -> int:
-    """The process's umask, which can only be read by setting it."""
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+def _named(path: str | os.PathLike[str]) -> Path:
+    target = Path(path)
+    if not target.name:
+        raise IgsrError(f"Cannot write {str(path)!r}: it is not a name; give the name to write.")
+    return target

@@ -49,7 +49,7 @@ def _locked(path: Path) -> int | None:
     while True:
         file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
         try:
-            is_free = _try_lock(file)
+            is_free = try_lock(file)
             if is_free is None:
                 os.unlink(path)
                 os.close(file)
@@ -72,7 +72,7 @@ def _locked(path: Path) -> int | None:
             raise
 
 
-def _try_lock(file: int) -> bool | None:
+def try_lock(file: int) -> bool | None:
     """Whether an open file could be locked; None if locks do not work there."""
     try:
         import fcntl

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Mapping, MutableMapping
+from itertools import pairwise
 from typing import Any, ClassVar, NamedTuple
 
 import typer
@@ -11,6 +12,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from igsr._internal.extras import naming_extra
 from igsr.cli.error_messages import error_messages
+from igsr.errors import IgsrError
 
 
 class LazyCommand(NamedTuple):
@@ -60,7 +62,16 @@ class LazyGroup(TyperGroup):
                     raise
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Find the command that ``args`` names and import it; see ``TyperGroup``."""
+        """Find the command that ``args`` names and import it; see ``TyperGroup``.
+
+        Raises:
+            IgsrError: one of ``args`` is empty. As a path it would mean the current folder.
+        """
+        for before, word in pairwise(args):
+            option, equals, value = word.partition("=")
+            if not word or (option.startswith("-") and equals and not value):
+                named = option or (before if before.startswith("-") else "An argument")
+                raise IgsrError(f"{named} is empty; give a value, or leave it out")
         name, command, rest = super().resolve_command(ctx, args)
         if name is not None:
             command = load_command(name, self.table[name])

@@ -15,7 +15,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from igsr._internal.atomic_write import remove_unfinished
 from igsr._internal.choices import FitBackend
 from igsr._internal.event import Listener
 from igsr.cameras import AUTO as AUTO_ESTIMATOR
@@ -272,8 +271,6 @@ def _prepared_folder(run: Run) -> Path | None:
     if run.out is None:
         return None
     checkpoints = run.out / "checkpoints"
-    for folder in (run.out, checkpoints, *run.out.glob("rounds/[0-9]*")):
-        remove_unfinished(folder)
     if run.resume:
         for name, usage in parts_so_far(run.out).items():
             run.parts.add(name, usage)

@@ -21,6 +21,7 @@ import numpy as np
 from PIL import Image
 
 import igsr
+from igsr._internal.json_file import write_json
 from igsr._internal.part_usage import Meter
 from igsr._internal.worker_processes import in_a_process
 from igsr.blocks import BlockOptions, fit_in_blocks
@@ -120,7 +121,7 @@ def main() -> None:
     kept = args.out / "whole.json"
     if not kept.is_file():
         given = str(folder), str(args.out), args.max_size, settings
-        kept.write_text(json.dumps(in_a_process(whole_fit, *given)))
+        write_json(kept, in_a_process(whole_fit, *given))
     whole = json.loads(kept.read_text())
     psnr = mean(list(whole["views"].values()))
     found = [{"run": "whole", "psnr": psnr, **{k: whole[k] for k in whole if k != "views"}}]

@@ -15,7 +15,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import shutil
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -25,10 +24,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
 from PIL import Image
 
-from igsr._internal.atomic_write import check_writable
+from igsr._internal.atomic_write import atomic_folder, check_writable
 from igsr.errors import IgsrError
 from igsr_lab.resumable_jobs import execute
 from igsr_lab.synth.cameras import Viewpoint, draw_rig
@@ -199,40 +197,15 @@ def make_scene(folder: Path, seed: int, settings: CaptureSettings, index: int) -
     """Make one scene in a temporary folder, then rename that; return the row."""
     started = time.monotonic()
     final = folder / scene_name(index)
-    # Named after this process: another one may make the same scene at the same time.
-    unfinished = folder / _unfinished(final.name, os.getpid())
-    try:
-        _remove_abandoned(folder, final.name)
-        unfinished.mkdir(parents=True)
+    # Another process may make the same scene, with the same bits, at the same time.
+    with atomic_folder(final, replace=True) as unfinished:
         with one_threaded_mitsuba() as mitsuba:
             document = _photograph(unfinished, seed, index, settings)
             document["mitsuba"] = mitsuba.__version__
         document["pyoidn"] = version("pyoidn")
         _write_json(unfinished / "scene.json", document)
-        try:
-            unfinished.rename(final)
-        except OSError:
-            # Another process was first, with the same bits.
-            if _finished(final, document["recipe"]) is None:
-                raise
-    except OSError as error:
-        raise IgsrError(f"Cannot write {final}: {error.strerror or error}.") from error
-    finally:
-        shutil.rmtree(unfinished, ignore_errors=True)
     row = {key: document[key] for key in ("family", "kind", "contents")}
     return {"name": final.name, **row, "seconds": round(time.monotonic() - started, 1)}
-
-
-def _unfinished(name: str, process: int | str) -> str:
-    return f".{name}.{process}.unfinished"
-
-
-def _remove_abandoned(folder: Path, name: str) -> None:
-    """Remove the files of processes that were killed."""
-    for path in folder.glob(_unfinished(name, "*")):
-        process = path.name.split(".")[-2]
-        if not process.isdigit() or not psutil.pid_exists(int(process)):
-            shutil.rmtree(path, ignore_errors=True)
 
 
 def _photograph(folder: Path, seed: int, index: int, settings: CaptureSettings) -> Row:

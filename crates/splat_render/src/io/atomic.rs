@@ -1,32 +1,97 @@
 //! Files appear whole or not at all.
 
-use std::fs::File;
-use std::io::{BufWriter, Write};
+use std::ffi::OsString;
+use std::fs::{self, DirBuilder, File};
+use std::hash::{BuildHasher, RandomState};
+use std::io::{BufWriter, Result as IoResult, Write};
 use std::path::{Path, PathBuf};
 
 use crate::error::{Error, Result};
 
-/// Writes to a temporary file next to `path` and renames it; on errors the old file stays.
+/// End of the names of folders that hold unfinished files.
+const UNFINISHED: &[u8] = b".unfinished";
+
+/// Writes to a temporary file and renames it; on errors the old file stays. An old file's mode is kept.
+///
+/// Leftovers of writers to `path` that were killed are removed.
 pub fn write_atomically(
     path: &Path,
-    write: impl FnOnce(&mut BufWriter<File>) -> std::io::Result<()>,
+    write: impl FnOnce(&mut BufWriter<File>) -> IoResult<()>,
 ) -> Result<()> {
-    let name = path
-        .file_name()
-        .ok_or_else(|| Error::file(path, "is not a file name; give the file to write"))?;
-    let mut temporary = name.to_os_string();
-    temporary.push(format!(".{}.tmp", std::process::id()));
-    let temporary: PathBuf = path.with_file_name(temporary);
-    let run = || -> std::io::Result<()> {
-        let mut out = BufWriter::new(File::create(&temporary)?);
+    let run = || -> IoResult<()> {
+        let unfinished = Unfinished::of(path)?;
+        let temporary = unfinished.folder.join("new");
+        let mut out = BufWriter::new(File::create_new(&temporary)?);
         write(&mut out)?;
         out.flush()?;
+        if let Ok(old) = fs::symlink_metadata(path)
+            && old.is_file()
+        {
+            out.get_ref().set_permissions(old.permissions())?;
+        }
         out.get_ref().sync_all()?;
         drop(out);
-        std::fs::rename(&temporary, path)
+        fs::rename(&temporary, path)
     };
+    if path.file_name().is_none() {
+        return Err(Error::file(path, "is not a file name; give the file to write"));
+    }
     run().map_err(|error| {
-        let _ = std::fs::remove_file(&temporary);
         Error::file(path, format!("cannot be written ({error}); the existing file is unchanged"))
     })
+}
+
+/// A private folder next to a file, for the file's next content. Dropping it removes it.
+///
+/// It is locked as long as its process lives, on systems that lock folders. Python's `atomic_write`
+/// uses the same names and locks.
+struct Unfinished {
+    folder: PathBuf,
+    _lock: Option<File>,
+}
+
+impl Unfinished {
+    fn of(path: &Path) -> IoResult<Self> {
+        let mut prefix = OsString::from(".");
+        prefix.push(path.file_name().unwrap_or_default());
+        prefix.push("-");
+        remove_leftovers(path, prefix.as_encoded_bytes());
+        loop {
+            let mut name = prefix.clone();
+            name.push(format!("{:016x}.unfinished", RandomState::new().hash_one(0)));
+            let folder = path.with_file_name(name);
+            let mut builder = DirBuilder::new();
+            #[cfg(unix)]
+            std::os::unix::fs::DirBuilderExt::mode(&mut builder, 0o700);
+            builder.create(&folder)?;
+            let lock = File::open(&folder).ok().filter(|file| file.lock().is_ok());
+            // Another writer may have removed it before it was locked.
+            if folder.is_dir() {
+                return Ok(Self { folder, _lock: lock });
+            }
+        }
+    }
+}
+
+impl Drop for Unfinished {
+    fn drop(&mut self) {
+        let _ = fs::remove_dir_all(&self.folder);
+    }
+}
+
+/// Removes the unlocked folders of the file `path`.
+fn remove_leftovers(path: &Path, prefix: &[u8]) {
+    let parent = path.parent().filter(|parent| !parent.as_os_str().is_empty());
+    for entry in fs::read_dir(parent.unwrap_or(Path::new("."))).into_iter().flatten().flatten() {
+        let name = entry.file_name();
+        let name = name.as_encoded_bytes();
+        if name.starts_with(prefix)
+            && name.ends_with(UNFINISHED)
+            && entry.file_type().is_ok_and(|kind| kind.is_dir())
+            && let Ok(lock) = File::open(entry.path())
+            && lock.try_lock().is_ok()
+        {
+            let _ = fs::remove_dir_all(entry.path());
+        }
+    }
 }
