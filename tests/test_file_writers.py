@@ -6,6 +6,7 @@ import stat
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -213,6 +214,18 @@ def test_inputs_of_one_name_have_an_output_each():
     assert unique_stems(names[:2], ".png") == ["a", "a.jpg"]
     views = [scenes.pseudo_view(CAPTURE.views[0], name=name) for name in [*names, "images/a.png"]]
     assert len({name.lower() for name in png_names(views)}) == len(views)
+
+
+@pytest.mark.parametrize(
+    ("command", "of_each"), [(("render", "--cameras"), 1), (("denoise", "--capture"), 2)]
+)
+def test_commands_write_an_output_for_each_view(place, command, of_each, igsr_here):
+    made = [replace(CAPTURE.views[0], name=name) for name in ("a.png", "a.jpg", "../a.png")]
+    capture = scenes.write_capture(place / "capture", replace(CAPTURE, views=made))
+    name, option = command
+    done = igsr_here(name, place / "scene.ply", option, capture, "--out", place / "out")
+    assert done.returncode == 0, done.stderr
+    assert len(left_in(place / "out")) == 3 * of_each
 
 
 def test_the_message_after_an_interruption_says_whether_the_file_is_written(tmp_path):
