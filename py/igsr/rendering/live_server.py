@@ -5,7 +5,9 @@ It answers five kinds of GET requests; their names are never used as paths.
 
 from __future__ import annotations
 
+import contextlib
 import hmac
+import io
 import ipaddress
 import json
 import logging
@@ -14,8 +16,12 @@ import socket
 import socketserver
 import sys
 import threading
+import time
+from collections import Counter
+from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
 from urllib.parse import parse_qs
 
 from igsr.errors import IgsrError
@@ -26,12 +32,16 @@ logger = logging.getLogger(__name__)
 #: The default port, and how many to try if it is taken.
 PORT = 8765
 PORTS_TO_TRY = 20
-MAX_CONCURRENT_REQUESTS = 64
-#: Further requests are dropped after this time.
-QUEUE_TIMEOUT_S = 10.0
-#: Silent clients are dropped after this time.
-CLIENT_TIMEOUT_S = 30.0
-CHUNK_BYTES = 1 << 16
+#: Maximum numbers of connections, each with a thread: without the token, and with it. For a
+#: further one, an older one of its kind is closed.
+MAX_WITHOUT_TOKEN = 64
+MAX_WITH_TOKEN = 128
+#: Time to receive a whole request, and to send a whole answer: a large model, over a slow line.
+REQUEST_TIMEOUT_S = 10.0
+ANSWER_TIMEOUT_S = 300.0
+MAX_REQUEST_BYTES = 1 << 14
+#: Memory of the system for an answer that is being sent: several MB unless it is limited.
+SEND_BUFFER_BYTES = 1 << 18
 
 
 def is_loopback(host: str) -> bool:
@@ -42,19 +52,36 @@ def is_loopback(host: str) -> bool:
         return False
 
 
+@dataclass
+class _Connection:
+    request: Any  # its socket
+    address: str
+    has_token: bool = False
+    is_closed: bool = False
+
+    def close(self) -> None:
+        """End the waiting of its thread, which closes the socket."""
+        self.is_closed = True
+        with contextlib.suppress(OSError):  # the client was faster
+            self.request.shutdown(socket.SHUT_RDWR)
+
+
 class ViewServer(ThreadingHTTPServer):
     """A server that answers requests whose path begins with its token."""
 
     daemon_threads = True
-    # The default backlog of 5 drops requests of a browser under load.
-    request_queue_size = 128
+    # A client that finds the backlog full tries again only after a second.
+    request_queue_size = 1024
     # On Windows this would share a port with another program.
     allow_reuse_address = sys.platform != "win32"
 
     def __init__(self, view: LiveView, host: str, port: int) -> None:
         self.view = view
         self.token = secrets.token_urlsafe(16)
-        self._slots = threading.BoundedSemaphore(MAX_CONCURRENT_REQUESTS)
+        self._connections: dict[object, _Connection] = {}  # by socket, the oldest first
+        self._lock = threading.Lock()
+        # By whether they have the token.
+        self._room = {kind: threading.Condition(self._lock) for kind in (False, True)}
         if ":" in host:
             self.address_family = socket.AF_INET6
         super().__init__((host, port), _Handler)
@@ -72,23 +99,59 @@ class ViewServer(ThreadingHTTPServer):
         socketserver.TCPServer.server_bind(self)
         self.server_name, self.server_port = str(self.server_address[0]), self.server_address[1]
 
-    def process_request(self, request: object, client_address: object) -> None:
-        """Answer in a new thread, as soon as fewer than the maximum are running."""
-        if not self._slots.acquire(timeout=QUEUE_TIMEOUT_S):
-            self.shutdown_request(request)  # type: ignore[arg-type]
-            return
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Answer in a new thread."""
+        connection = _Connection(request, client_address[0])
+        with self._lock:
+            self._make_room(connection)
+            self._connections[request] = connection
         try:
-            super().process_request(request, client_address)  # type: ignore[arg-type]
+            super().process_request(request, client_address)
         except RuntimeError:  # no thread can be started
-            self._slots.release()
+            self._forget(request)
             raise
 
-    def process_request_thread(self, request: object, client_address: object) -> None:
-        """Answer, and free the slot."""
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Answer, and make room for another connection."""
         try:
-            super().process_request_thread(request, client_address)  # type: ignore[arg-type]
+            super().process_request_thread(request, client_address)
         finally:
-            self._slots.release()
+            self._forget(request)
+
+    def accept_token(self, request: object) -> None:
+        """Count a connection as one with the token."""
+        with self._lock:
+            connection = self._connections[request]
+            self._make_room(connection, has_token=True)
+            connection.has_token = True
+            self._room[False].notify()
+
+    def is_open(self, request: object) -> bool:
+        """Return whether a connection is open for its answer."""
+        return not self._connections[request].is_closed
+
+    def _forget(self, request: object) -> None:
+        with self._lock:
+            self._room[self._connections.pop(request).has_token].notify()
+
+    def _make_room(self, connection: _Connection, has_token: bool = False) -> None:
+        """Without room, close the oldest connection of the address that has most.
+
+        Raises:
+            ConnectionError: ``connection`` was closed meanwhile, for others.
+        """
+        most = MAX_WITH_TOKEN if has_token else MAX_WITHOUT_TOKEN
+        has_changed = False
+        while not connection.is_closed:
+            kind = [one for one in self._connections.values() if one.has_token == has_token]
+            if len(kind) < most:
+                return
+            still_open = [one for one in kind if not one.is_closed]
+            if still_open and not has_changed:
+                held = Counter(one.address for one in still_open)
+                max(still_open, key=lambda one: held[one.address]).close()
+            has_changed = self._room[has_token].wait(timeout=0.1)
+        raise ConnectionError
 
     def handle_error(self, request: object, client_address: object) -> None:
         """Log an error, unless a browser disconnected."""
@@ -99,9 +162,23 @@ class ViewServer(ThreadingHTTPServer):
 class _Handler(BaseHTTPRequestHandler):
     """Answers one request, over HTTP/1.0: connections are not kept open."""
 
-    timeout = CLIENT_TIMEOUT_S
     server: ViewServer
     server_version, sys_version = "igsr", ""
+
+    def setup(self) -> None:
+        """Receive the whole request: the base class limits single lines and pauses only."""
+        super().setup()
+        self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
+        received = b""
+        end = time.monotonic() + REQUEST_TIMEOUT_S
+        while b"\r\n\r\n" not in received and len(received) < MAX_REQUEST_BYTES:
+            self.connection.settimeout(max(end - time.monotonic(), 1e-3))
+            piece = self.connection.recv(MAX_REQUEST_BYTES)
+            if not piece:
+                break
+            received += piece
+        self.rfile = io.BytesIO(received)
+        self.connection.settimeout(ANSWER_TIMEOUT_S)
 
     def do_GET(self) -> None:
         """Answer a request if it has the token."""
@@ -110,7 +187,9 @@ class _Handler(BaseHTTPRequestHandler):
         if not hmac.compare_digest(token.encode(), self.server.token.encode()):
             message = "This address has no token or an old one; use the one that igsr view printed."
             self._answer_text(HTTPStatus.FORBIDDEN, message)
-        elif not slash:
+            return
+        self.server.accept_token(self.request)
+        if not slash:
             self.send_response(HTTPStatus.MOVED_PERMANENTLY)
             self.send_header("Location", f"/{self.server.token}/")
             self.send_header("Content-Length", "0")
@@ -129,11 +208,12 @@ class _Handler(BaseHTTPRequestHandler):
                 page = view.page().encode("utf-8", errors="xmlcharrefreplace")
                 self._answer("text/html; charset=utf-8", page)
             elif name == "state":
-                self._answer_json(view.state())
+                state = json.dumps(view.state(), allow_nan=False).encode()
+                self._answer("application/json", state)
             elif name == "surroundings":
-                self._answer_json(view.surroundings())
+                self._answer("application/json", view.surroundings())
             elif name == "model":
-                self._answer("application/octet-stream", view.model(query["id"]))
+                self._answer("application/octet-stream", view.model(query["id"], self._is_open))
             elif name == "photo" and query["number"].isdecimal():
                 self._answer("image/jpeg", view.photo(int(query["number"])))
             else:
@@ -143,8 +223,8 @@ class _Handler(BaseHTTPRequestHandler):
         except KeyError:
             self._answer_text(HTTPStatus.NOT_FOUND, "This address does not exist.")
 
-    def _answer_json(self, value: object) -> None:
-        self._answer("application/json", json.dumps(value, allow_nan=False).encode())
+    def _is_open(self) -> bool:
+        return self.server.is_open(self.request)
 
     def _answer_text(self, status: HTTPStatus, message: str) -> None:
         content = message.encode("utf-8", errors="replace")
@@ -160,9 +240,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Referrer-Policy", "no-referrer")
         self.send_header("Cross-Origin-Resource-Policy", "same-origin")
         self.end_headers()
-        # In chunks, since the timeout applies to each write.
-        for start in range(0, len(content), CHUNK_BYTES):
-            self.wfile.write(content[start : start + CHUNK_BYTES])
+        self.wfile.write(content)  # the timeout is for all of it
 
 
 def open_server(view: LiveView, host: str, port: int | None) -> ViewServer:

@@ -7,7 +7,7 @@ import json
 import os
 import threading
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -36,11 +36,15 @@ PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png")
 MAX_PHOTO_SIDE_PX = 1600
 
 
+#: Longest wait for cameras; thousands appear on the page later.
+READING_WAIT_S = 0.5
+
+
 @dataclass(frozen=True)
 class _Surroundings:
     version: str
-    cameras: list[tuple[PageCamera, Path | None]]  # with their photos
-    background: Color
+    photos: list[Path | None]  # of the cameras
+    answer: bytes  # JSON
 
 
 class LiveView:
@@ -54,7 +58,9 @@ class LiveView:
     def __init__(self, paths: Sequence[Path], cameras: Path | None = None) -> None:
         self._paths = list(paths)
         self._cameras = cameras
-        self._surroundings: _Surroundings | None = None
+        self._surroundings = _Surroundings("", [], _json([], [], "", BLACK))
+        self._reading: threading.Thread | None = None
+        self._start_reading = threading.Lock()
         self._packed: OrderedDict[tuple[str, str], bytes] = OrderedDict()
         # Concurrent requests for a model pack it once.
         self._packing = threading.Lock()
@@ -80,39 +86,42 @@ class LiveView:
                 {"id": model.id, "label": model.label, "version": model.version} for model in models
             ],
             "newest": models[-1].id if models else "",
-            "surroundings": self._surroundings_version(),
+            "surroundings": self._current_surroundings().version,
         }
 
-    def surroundings(self) -> dict[str, Any]:
-        """Return cameras, sorted by whether they have a photo, up axis and background."""
-        now = self._current_surroundings()
-        answer = surroundings([camera for camera, _ in now.cameras], now.background)
-        for number, (_, photo) in enumerate(now.cameras):
-            if photo is not None:
-                address = f"photo?number={number}&version={now.version}"
-                answer["cameras"][number]["photo"] = address
-        return answer
+    def surroundings(self) -> bytes:
+        """Return the surroundings of the state's version, as JSON.
+
+        They are cameras, sorted by whether they have a photo, up axis and background.
+        """
+        return self._current_surroundings().answer
 
     def photo(self, number: int) -> bytes:
         """Return the photo of a camera as JPEG; a KeyError if there is none."""
-        cameras = self._current_surroundings().cameras
-        path = cameras[number][1] if 0 <= number < len(cameras) else None
+        photos = self._current_surroundings().photos
+        path = photos[number] if 0 <= number < len(photos) else None
         if path is None:
             raise KeyError(number)
         return _jpeg(path)
 
-    def model(self, id: str) -> bytes:
+    def model(self, id: str, is_open: Callable[[], bool] = lambda: True) -> bytes:
         """Return a model for the page: the length of a JSON text (u32), the text, packed splats.
 
-        Raises a KeyError if the id is unknown.
+        Raises a KeyError if the id is unknown, and a ConnectionError if the connection is closed
+        while other requests are answered.
         """
         model = {one.id: one for one in self._models()}[id]
         key = (model.id, model.version)
-        with self._packing:
+        while not self._packing.acquire(timeout=0.1):
+            if not is_open():
+                raise ConnectionError
+        try:
             packed = self._packed.pop(key, None) or _packed(model)
             self._packed[key] = packed
             while len(self._packed) > MAX_PACKED_MODELS:
                 self._packed.popitem(last=False)
+        finally:
+            self._packing.release()
         return packed
 
     def _models(self) -> list[LiveModel]:
@@ -149,12 +158,33 @@ class LiveView:
         return next((color for color in colors if color is not None), BLACK)
 
     def _current_surroundings(self) -> _Surroundings:
+        """The surroundings that were read last; after a change they are read in a thread."""
         version = self._surroundings_version()
-        if self._surroundings is None or self._surroundings.version != version:
-            cameras = [camera for file in self._camera_files() for camera in _cameras(file)]
-            cameras.sort(key=lambda camera: camera[1] is None)
-            self._surroundings = _Surroundings(version, cameras, self._background())
+        with self._start_reading:
+            is_reading = self._reading is not None and self._reading.is_alive()
+            if self._surroundings.version != version and not is_reading:
+                self._reading = threading.Thread(target=self._read, args=(version,), daemon=True)
+                self._reading.start()
+        if self._reading is not None:
+            self._reading.join(READING_WAIT_S)
         return self._surroundings
+
+    def _read(self, version: str) -> None:
+        found = [camera for file in self._camera_files() for camera in _cameras(file)]
+        found.sort(key=lambda camera: camera[1] is None)
+        cameras, photos = [camera for camera, _ in found], [photo for _, photo in found]
+        answer = _json(cameras, photos, version, self._background())
+        self._surroundings = _Surroundings(version, photos, answer)
+
+
+def _json(
+    cameras: list[PageCamera], photos: list[Path | None], version: str, background: Color
+) -> bytes:
+    answer = surroundings(cameras, background)
+    for number, photo in enumerate(photos):
+        if photo is not None:
+            answer["cameras"][number]["photo"] = f"photo?number={number}&version={version}"
+    return json.dumps(answer, allow_nan=False).encode()
 
 
 def _cameras(file: Path) -> list[tuple[PageCamera, Path | None]]:
@@ -163,17 +193,17 @@ def _cameras(file: Path) -> list[tuple[PageCamera, Path | None]]:
         cameras = cameras_of(file) if file.is_file() else []
     except IgsrError:
         return []
-    return [(camera, _photo(file.parent, camera.name)) for camera in cameras]
+    folder = os.path.realpath(file.parent)
+    return [(camera, _photo(folder, camera.name)) for camera in cameras]
 
 
-def _photo(folder: Path, name: str) -> Path | None:
-    """The photo of an untrusted name, only if it is inside ``folder``."""
+def _photo(folder: str, name: str) -> Path | None:
+    """The photo of an untrusted name, only if it is inside ``folder``, a real path."""
     if not name.lower().endswith(PHOTO_SUFFIXES) or "\0" in name:
         return None
     try:
-        inside = os.path.realpath(folder)
-        path = os.path.realpath(os.path.join(inside, name))
-        if os.path.commonpath([inside, path]) != inside or not os.path.isfile(path):
+        path = os.path.realpath(os.path.join(folder, name))
+        if os.path.commonpath([folder, path]) != folder or not os.path.isfile(path):
             return None
     except (OSError, ValueError):
         return None
