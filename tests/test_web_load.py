@@ -135,7 +135,7 @@ def test_those_with_the_token_are_kept_and_the_address_with_most_makes_room(scen
         few.sendall(b"ET / HTTP/1.0\r\n\r\n")
         assert few.recv(100).startswith(b"HTTP/1.0 403")
         many[0].settimeout(5.0)
-        assert many[0].recv(1) == b"", "the oldest of the other address is closed"
+        assert many[0].recv(1) == b"", "the older connections are closed"
         size = 0
         while piece := reader.recv(1 << 20):
             size += len(piece)

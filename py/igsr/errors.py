@@ -3,6 +3,14 @@
 from __future__ import annotations
 
 
+def printable(text: str) -> str:
+    """Escape line breaks, terminal codes and the like."""
+    return "".join(
+        letter if letter.isprintable() else letter.encode("unicode_escape").decode()
+        for letter in text
+    )
+
+
 class IgsrError(ValueError):
     """An argument, option or file that cannot be used.
 
@@ -16,12 +24,7 @@ class IgsrError(ValueError):
 
     def __init__(self, message: str) -> None:
         """Escape what cannot be printed."""
-        super().__init__(
-            "".join(
-                letter if letter.isprintable() else letter.encode("unicode_escape").decode()
-                for letter in message
-            )
-        )
+        super().__init__(printable(message))
 
 
 class MissingExtraError(IgsrError, ImportError):

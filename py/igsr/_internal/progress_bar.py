@@ -10,6 +10,7 @@ from contextvars import ContextVar
 from typing import Any
 
 from igsr._internal.event import NOTE, Event
+from igsr.errors import printable
 
 #: Set within a run: the runs that it starts show no bars of their own.
 _in_run: ContextVar[bool] = ContextVar("igsr_in_run", default=False)
@@ -23,14 +24,15 @@ def progress_bar(*, shown: bool = True) -> Iterator[Callable[[Event], None]]:
     fraction of the whole run move one bar; other stages have a bar of their own.
     """
     # The import takes half of a short command's time.
-    from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-    console = Console(file=sys.stderr, highlight=False)
+    from igsr._internal.plain_console import PlainConsole
+
+    console = PlainConsole(sys.stderr)
     bar = Progress(
-        TextColumn("{task.description} {task.fields[counts]}"),
+        TextColumn("{task.description} {task.fields[counts]}", markup=False),
         BarColumn(bar_width=30),
-        TextColumn("{task.fields[message]}"),
+        TextColumn("{task.fields[message]}", markup=False),
         TimeRemainingColumn(compact=True),
         console=console,
         # Elsewhere, rich would print an empty line in place of the bar.
@@ -44,7 +46,7 @@ def progress_bar(*, shown: bool = True) -> Iterator[Callable[[Event], None]]:
             return
         if event.stage == NOTE:
             if shown:
-                console.print(event.message, markup=False, soft_wrap=True)
+                console.print(event.message, soft_wrap=True)
             return
         bar.start()
         key = "whole run" if event.part is not None else event.stage
@@ -60,7 +62,7 @@ def progress_bar(*, shown: bool = True) -> Iterator[Callable[[Event], None]]:
             completed=done,
             total=total,
             counts=counts,
-            message=event.message,
+            message=printable(event.message),
             visible=True,
         )
 

@@ -92,4 +92,4 @@ def denoise_command(
     if as_json:
         print_json({"files": files})
         return
-    output_console().print(f"{len(views)} views: {out}", markup=False)
+    output_console().print(f"{len(views)} views: {out}")

@@ -17,7 +17,7 @@ from types import FrameType
 
 import typer
 
-from igsr.errors import IgsrError
+from igsr.errors import IgsrError, printable
 
 #: Exit status after Ctrl-C and SIGTERM: 128 plus the signal, as shells report it.
 INTERRUPTED = 130
@@ -121,7 +121,7 @@ def _raise(number: int, frame: FrameType | None) -> None:
 
 def print_message(message: str) -> None:
     """Print an error, a warning or a note as one line on stderr, with a full stop at its end."""
-    message = " ".join(message.split())
+    message = printable(" ".join(message.split()))
     print(message if message.endswith((".", "!", "?")) else message + ".", file=sys.stderr)
 
 

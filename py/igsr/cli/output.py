@@ -21,16 +21,16 @@ _FLOATERS = {
 
 def error_console() -> Console:
     """The console for progress: stderr."""
-    from rich.console import Console
+    from igsr._internal.plain_console import PlainConsole
 
-    return Console(file=sys.stderr, highlight=False)
+    return PlainConsole(sys.stderr)
 
 
 def output_console() -> Console:
     """The console for results: stdout, without line breaks inside long paths."""
-    from rich.console import Console
+    from igsr._internal.plain_console import PlainConsole
 
-    return Console(file=sys.stdout, highlight=False, soft_wrap=True)
+    return PlainConsole(sys.stdout, soft_wrap=True)
 
 
 def print_json(value: dict[str, Any]) -> None:
@@ -43,7 +43,7 @@ def print_json(value: dict[str, Any]) -> None:
 def print_files(out: Path, names: list[str]) -> None:
     """Print the paths of those files that exist in a folder."""
     paths = [str(out / name) for name in names if (out / name).exists()]
-    output_console().print("  ".join(paths), style="dim", markup=False)
+    output_console().print("  ".join(paths), style="dim")
 
 
 def score_line(scores: dict[str, Any]) -> str:

@@ -9,6 +9,7 @@ import os
 import sys
 
 from igsr.cli.error_messages import DEBUG_VARIABLE
+from igsr.errors import printable
 
 #: Environment variables for the number of threads of the renderer, torch and numpy.
 THREAD_VARIABLES = (
@@ -38,8 +39,13 @@ def log_to_stderr(verbosity: int) -> None:
     """Print igsr's log to stderr: level INFO for 1, DEBUG for 2."""
     import logging
 
+    def escape(record: logging.LogRecord) -> bool:
+        record.msg, record.args = printable(record.getMessage()), None
+        return True
+
     logger = logging.getLogger("igsr")
     logger.setLevel(logging.INFO if verbosity == 1 else logging.DEBUG)
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(logging.Formatter("%(asctime)s %(name)s: %(message)s", "%H:%M:%S"))
+    handler.addFilter(escape)
     logger.handlers[:] = [handler]

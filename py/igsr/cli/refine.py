@@ -126,7 +126,7 @@ def _tests(refined: Refined) -> list[dict[str, float | None]]:
 
 def _print_summary(refined: Refined, report: dict[str, Any], out: Path) -> None:
     console = output_console()
-    console.print(f"Rounds: {len(refined.rounds)}; stopped: {refined.stop}", markup=False)
+    console.print(f"Rounds: {len(refined.rounds)}; stopped: {refined.stop}")
     by_round = " -> ".join(f"{test['psnr']:.2f}" for test in _tests(refined))
     if by_round:
         console.print(f"PSNR of the test views by round: {by_round} dB")

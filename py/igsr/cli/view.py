@@ -140,7 +140,7 @@ def _cameras(named: str | None, scene: Path, folder: Path) -> Path | None:
     try:
         return _readable(capture, folder)
     except IgsrError as error:  # the scene can be shown without cameras
-        print(f"{error}; no cameras are shown.", file=sys.stderr)
+        print_message(f"{error}; no cameras are shown")
         return None
 
 
@@ -156,7 +156,7 @@ def _readable(capture: Path, folder: Path) -> Path:
     for path in (capture, capture / CAMERAS):
         if path.name == CAMERAS and path.is_file():
             return path
-    print(f"Reading {capture} ...", file=sys.stderr, flush=True)
+    print_message(f"Reading {capture} ...")
     write_for_viewer(load_capture(capture), folder)
     return folder / CAMERAS
 

@@ -181,6 +181,6 @@ def _print(
     console.width = max(console.width, console.measure(table, options=wide).maximum)
     console.print(table)
     for line in lines:
-        console.print(line, markup=False)  # a reason may have brackets
+        console.print(line)
     console.print(machine_line(report["machine"]), style="dim")
     console.print(report["machine"]["protocol"], style="dim")

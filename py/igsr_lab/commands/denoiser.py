@@ -124,7 +124,7 @@ def pairs_command(
         print_json({"fits": rows})
         return
     renders = sum(row["renders"] for row in rows)
-    output_console().print(f"{renders} pairs of {len(rows)} fits: {out}", markup=False)
+    output_console().print(f"{renders} pairs of {len(rows)} fits: {out}")
 
 
 @settings_options(Training)
@@ -205,6 +205,5 @@ def train_command(
         return
     output_console().print(
         f"validation {last['validation_psnr_before']:.2f} -> {last['validation_psnr']:.2f} dB: "
-        f"{out / WEIGHTS}",
-        markup=False,
+        f"{out / WEIGHTS}"
     )

@@ -15,7 +15,7 @@ import typer
 
 from igsr.cli.error_messages import error_messages
 from igsr.cli.options import FitBackendOption, JsonOption, option, resolved
-from igsr.cli.output import error_console, output_console, print_json
+from igsr.cli.output import error_console, print_json
 from igsr.errors import IgsrError
 from igsr_lab.commands.options import JobsOption, RayOption, TimeLeft
 
@@ -208,7 +208,7 @@ def _run(
                 time_left = TimeLeft()
             else:
                 text += f"; {time_left(done, total)}"
-            console.print(text, markup=False)
+            console.print(text)
 
         given = {
             name: tuple(value) if isinstance(value, list) else value
@@ -222,7 +222,7 @@ def _run(
     if as_json:
         print_json(report)
         return
-    output_console().print((out / "study.md").read_text(encoding="utf-8"), markup=False)
+    typer.echo((out / "study.md").read_text(encoding="utf-8"))
 
 
 def _files_by_name(given: list[str]) -> dict[str, Path]:

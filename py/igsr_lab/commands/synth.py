@@ -68,4 +68,4 @@ def synth_command(
         print_json(report)
         return
     made = sum(row["seconds"] is not None for row in report["scenes"])
-    output_console().print(f"{made} made, {scenes - made} already finished: {out}", markup=False)
+    output_console().print(f"{made} made, {scenes - made} already finished: {out}")
