@@ -107,6 +107,7 @@ def test_text_is_printed_as_it_is(printer, monkeypatch, capsys):
     text = printed.out + printed.err
     assert printable(CODES) in text
     assert "[/b]:smile:[old]" in text
+    assert "Traceback" not in text
     if printer != "progress":  # the bar itself moves the cursor
         assert_printable(text)
     for code in ("\x07", "\x1b]", "\x9b", "\u202e"):

@@ -1,6 +1,7 @@
 """``scene.html`` in a real browser: pictures as the renderer's, mouse, touch and keys."""
 
 import base64
+import json
 import re
 import time
 
@@ -244,6 +245,36 @@ def test_names_cannot_inject_scripts(browser, tmp_path):
     assert browser.run("window.igsr.error") is None
     assert browser.run("window.broken") is None
     assert "</script>" in browser.run("document.getElementById('cameras').options[1].text")
+
+
+SCRIPT = "</script><script>alert(1)</script>"
+
+
+def with_comments(path):
+    """Script in the comments of a .ply."""
+    lines = f"comment {SCRIPT}\nobj_info {SCRIPT}\ncomment origin {SCRIPT}\nelement vertex"
+    path.write_bytes(path.read_bytes().replace(b"element vertex", lines.encode(), 1))
+
+
+def with_names(path):
+    """Script in all names of a .gltf."""
+    document = json.loads(path.read_text())
+    document["asset"] |= {"generator": SCRIPT, "copyright": SCRIPT}
+    for parts in document.values():
+        for part in parts if isinstance(parts, list) else []:
+            if isinstance(part, dict):
+                part |= {"name": SCRIPT, "extras": {SCRIPT: SCRIPT}}
+    path.write_text(json.dumps(document))
+
+
+@pytest.mark.parametrize(("ending", "change"), [(".ply", with_comments), (".gltf", with_names)])
+def test_texts_of_splat_files_are_not_in_the_page(tmp_path, ending, change):
+    path = tmp_path / f"scene{ending}"
+    model().save(path)
+    expected = scene_page(igsr.Splats.load(path))
+    change(path)
+    assert SCRIPT.encode() in path.read_bytes()
+    assert scene_page(igsr.Splats.load(path)) == expected
 
 
 @pytest.mark.parametrize("background", [(0.0, 0.0), (0.0, 0.0, 1.5), (0.0, 0.0, float("nan"))])

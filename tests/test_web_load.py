@@ -14,7 +14,7 @@ from scene_pages import model
 from web_views import served, state_of, with_token
 
 from igsr.capture.write_transforms import write_cameras
-from igsr.rendering import live_server, live_view
+from igsr.rendering import live_server, live_view, run_folder
 
 CLIENTS = 500
 SECONDS = 2.5
@@ -174,6 +174,18 @@ def test_the_page_does_not_wait_for_cameras(large_capture, monkeypatch):
             assert time.monotonic() < end
         assert len(json.loads(with_token(server, "surroundings")[1])["cameras"]) == 2
     assert len(reads) == 1
+
+
+def test_files_of_a_run_are_parsed_again_only_after_a_change(large_capture):
+    report = large_capture / "report.json"
+    report.write_text('{"psnr": 20, "ssim": 0.5, "protocol": {}}')
+    with served(large_capture) as server:
+        state_of(server)
+        parsed = run_folder._parsed.cache_info().misses
+        assert state_of(server)["scores"]["rows"][0][1] == "20.00"
+        assert run_folder._parsed.cache_info().misses == parsed
+        report.write_text('{"psnr": 21.5, "ssim": 0.5, "protocol": {}}')
+        assert state_of(server)["scores"]["rows"][0][1] == "21.50"
 
 
 @pytest.mark.parametrize("host", ["attacker.example", "127.0.0.1:80", "", "\x1b[2J", "a" * 5000])

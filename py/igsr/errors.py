@@ -23,7 +23,7 @@ class IgsrError(ValueError):
     """
 
     def __init__(self, message: str) -> None:
-        """Escape what cannot be printed."""
+        """Escape the message."""
         super().__init__(printable(message))
 
 

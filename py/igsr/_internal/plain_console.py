@@ -11,12 +11,12 @@ from igsr.errors import printable
 
 
 class PlainConsole(Console):
-    """A console for names from files: brackets are no markup, terminal codes are escaped."""
+    """A console that ignores markup in names, and escapes terminal codes."""
 
     def __init__(self, file: IO[str], **options: Any) -> None:
         """Print to ``file``; ``options`` are rich's."""
         super().__init__(file=file, highlight=False, markup=False, emoji=False, **options)
 
     def render_str(self, text: str, **options: Any) -> Text:
-        """Make text of all strings that are printed, also of those in tables."""
+        """Make text of every printed string, in tables, too."""
         return super().render_str(printable(text), **options)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -112,16 +113,11 @@ class LiveView:
         """
         model = {one.id: one for one in self._models()}[id]
         key = (model.id, model.version)
-        while not self._packing.acquire(timeout=0.1):
-            if not is_open():
-                raise ConnectionError
-        try:
+        with _turn(self._packing, is_open):
             packed = self._packed.pop(key, None) or _packed(model)
             self._packed[key] = packed
             while len(self._packed) > MAX_PACKED_MODELS:
                 self._packed.popitem(last=False)
-        finally:
-            self._packing.release()
         return packed
 
     def _models(self) -> list[LiveModel]:
@@ -185,6 +181,18 @@ def _json(
         if photo is not None:
             answer["cameras"][number]["photo"] = f"photo?number={number}&version={version}"
     return json.dumps(answer, allow_nan=False).encode()
+
+
+@contextlib.contextmanager
+def _turn(lock: threading.Lock, is_open: Callable[[], bool]) -> Iterator[None]:
+    """Wait for a lock, as long as the connection is open."""
+    while not lock.acquire(timeout=0.1):
+        if not is_open():
+            raise ConnectionError
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 def _cameras(file: Path) -> list[tuple[PageCamera, Path | None]]:

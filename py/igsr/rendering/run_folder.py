@@ -9,6 +9,7 @@ import json
 import math
 import time
 import warnings
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -169,6 +170,16 @@ def _color(value: object) -> Color | None:
 
 
 def _read(path: Path) -> dict[str, Any]:
+    """The content of a file, which each page asks for once a second."""
+    try:
+        status = path.stat()
+    except OSError:
+        return {}
+    return _parsed(path, status.st_ino, status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(maxsize=8)
+def _parsed(path: Path, *version: int) -> dict[str, Any]:
     try:
         if not path.is_file() or path.stat().st_size > MAX_JSON_BYTES:
             return {}
