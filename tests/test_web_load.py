@@ -4,6 +4,7 @@ import contextlib
 import json
 import resource
 import socket
+import sys
 import threading
 import time
 
@@ -115,6 +116,17 @@ def test_each_request_has_a_deadline(scene, monkeypatch, kind):
         assert not server._connections
 
 
+def test_only_the_first_bytes_of_a_long_request_are_received(scene):
+    with served(scene) as server:
+        client = socket.create_connection(("127.0.0.1", server.server_port))
+        client.settimeout(live_server.REQUEST_TIMEOUT_S / 2)
+        client.sendall(b"GET / HTTP/1.0\r\nname: " + 2 * live_server.MAX_REQUEST_BYTES * b"x")
+        with contextlib.suppress(ConnectionError):
+            client.recv(100)
+        client.close()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="127.0.0.2 is an address of Linux only")
 def test_those_with_the_token_are_kept_and_the_address_with_most_makes_room(scene, monkeypatch):
     monkeypatch.setattr(live_server, "MAX_WITHOUT_TOKEN", 3)
     with served(scene) as server:
