@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from igsr._internal.input_files import open_file
 from igsr.capture.image_files import PhotoHeader
 from igsr.capture.load import describe_capture
 from igsr.capture.photos import DescribedCapture, Shot, checked_headers, photo_of
@@ -118,7 +119,7 @@ def file_mark(path: Path) -> str:
     Reading a large capture in full would take too long; checkpoints hash the decoded pixels.
     """
     try:
-        with open(path, "rb") as file:
+        with open_file(path) as file:
             size = os.fstat(file.fileno()).st_size
             digest = hashlib.sha256(size.to_bytes(8, "little"))
             digest.update(file.read(CHECKSUM_BYTES))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -12,6 +11,7 @@ from typing import Any
 
 from igsr import _core
 from igsr._internal.event import Event, Listener
+from igsr._internal.input_files import read_json
 from igsr._internal.json_file import write_json
 from igsr._internal.ray_jobs import RayCluster
 from igsr._internal.user_warning import warn_user
@@ -38,8 +38,8 @@ def run_tasks(
     """
     rows: dict[str, dict[str, Any]] = {}
     for task in tasks:
-        with contextlib.suppress(OSError, ValueError):
-            row = json.loads(task.row_file.read_text(encoding="utf-8"))
+        with contextlib.suppress(OSError, ValueError, AttributeError):
+            row = read_json(task.row_file)
             if row.get("key") == task.key() and (task.folder / SPLATS_FILE).is_file():
                 rows[task.name] = row
     missing = [task for task in tasks if task.name not in rows]

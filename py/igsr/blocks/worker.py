@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import os
 import socket
@@ -17,6 +16,7 @@ import numpy.typing as npt
 
 from igsr import _core
 from igsr._internal.event import Event
+from igsr._internal.input_files import read_json
 from igsr._internal.json_file import write_json
 from igsr._internal.part_usage import Meter
 from igsr.blocks.crops import WHOLE, cropped
@@ -200,7 +200,7 @@ def _checkpoint_step(checkpoint: Path) -> int | None:
 def read_progress(folder: Path) -> dict[str, Any]:
     """The content of a task's progress file; empty before the first attempt."""
     try:
-        progress: dict[str, Any] = json.loads((folder / PROGRESS_FILE).read_text(encoding="utf-8"))
+        progress: dict[str, Any] = read_json(folder / PROGRESS_FILE)
         return progress
     except (OSError, ValueError):
         return {}

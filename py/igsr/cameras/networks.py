@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
+from igsr._internal.input_files import read_json
 from igsr._internal.name_lists import listed
 from igsr.errors import IgsrError
 
@@ -119,12 +119,10 @@ def config_of(path: Path) -> dict[str, Any] | None:
     try:
         if not config.exists():
             return None
-        if config.stat().st_size > MAX_CONFIG_BYTES:
-            raise ValueError("it is too long")
-        content = json.loads(config.read_bytes())
+        content = read_json(config, MAX_CONFIG_BYTES)
         if not isinstance(content, dict):
             raise ValueError("it is not a JSON object")
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError) as error:
         raise IgsrError(f"{config} cannot be read ({error}); download it again") from error
     return content
 

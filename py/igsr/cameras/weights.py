@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from igsr._internal.atomic_write import atomic_write
+from igsr._internal.input_files import open_file, read_file
 from igsr.errors import IgsrError
 
 #: Environment variable that forbids downloads, unless it is 0.
@@ -21,6 +22,7 @@ OFFLINE = "IGSR_OFFLINE"
 #: Environment variable with the server's address, by default huggingface.co.
 ENDPOINT = "HF_ENDPOINT"
 _HASHED_BYTES = 1 << 20
+_MAX_NAME_BYTES = 1000
 _FILES = ("model.safetensors", "config.json")
 
 
@@ -106,8 +108,8 @@ def cached_snapshots(model: str) -> list[Path]:
     """Folders of the cached revisions of "owner/name", the current one first, then by name."""
     folder = _model_folder(model)
     try:
-        current = (folder / "refs" / "main").read_text(errors="replace").strip()
-    except OSError:
+        current = read_file(folder / "refs" / "main", _MAX_NAME_BYTES).decode().strip()
+    except (OSError, ValueError):
         current = ""
     return sorted(folder.glob("snapshots/*/"), key=lambda path: (path.name != current, path.name))
 
@@ -214,7 +216,7 @@ def _has_hash(path: Path, etag: str | None) -> bool:
 
 
 def _digest(path: Path, digest: Any) -> str:
-    with path.open("rb") as file:
+    with open_file(path) as file:
         while part := file.read(_HASHED_BYTES):
             digest.update(part)
     return str(digest.hexdigest())

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from igsr._internal.input_files import open_file, read_file
 from igsr.errors import IgsrError
 
 # Parameters of COLMAP's camera models, in the order of their numbers.
@@ -107,7 +108,7 @@ def image_count(folder: Path) -> int:
     """The number of images of the model in a folder; 0 if it cannot be read."""
     try:
         if (folder / "images.bin").is_file():
-            with open(folder / "images.bin", "rb") as file:
+            with open_file(folder / "images.bin") as file:
                 return int(COUNT.unpack(file.read(COUNT.size))[0])
         return sum(1 for _, line in _lines(folder / "images.txt", keep_empty=True)) // 2
     except (OSError, struct.error, IgsrError):
@@ -145,7 +146,7 @@ def check_supported(model: str) -> None:
 
 def _read(path: Path) -> bytes:
     try:
-        return path.read_bytes()
+        return read_file(path)
     except OSError as error:
         raise IgsrError(f"{path} cannot be read ({error.strerror}); check it") from error
 

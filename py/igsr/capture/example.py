@@ -8,6 +8,7 @@ from pathlib import Path
 
 from igsr import _core
 from igsr._internal.atomic_write import atomic_write
+from igsr._internal.input_files import read_file
 
 
 def write_example(folder: str | os.PathLike[str]) -> Path:
@@ -38,7 +39,7 @@ def write_example(folder: str | os.PathLike[str]) -> Path:
             ]
             contents = json.dumps(document, indent=1).encode()
         path = folder / name
-        if not path.is_file() or path.read_bytes() != contents:
+        if not path.is_file() or read_file(path) != contents:
             with atomic_write(path) as temporary:
                 temporary.write_bytes(contents)
     return folder

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from igsr._internal.input_files import open_file
 from igsr.capture.image_files import SUFFIXES, is_file
 from igsr.capture.mask_files import MASK_FOLDERS, MaskFiles, is_mask_beside
 from igsr.capture.video_frames import VIDEO_SUFFIXES
@@ -202,7 +203,7 @@ def _is_render(file: Path) -> bool:
     if not is_image and file.suffix.lower() not in VIDEO_SUFFIXES:
         return False
     try:
-        with open(file, "rb") as opened:
+        with open_file(file) as opened:
             ends = opened.read(TAG_BYTES)
             if not is_image:
                 opened.seek(max(0, file.stat().st_size - VIDEO_TAG_BYTES))

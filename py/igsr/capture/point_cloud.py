@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from igsr._internal.input_files import read_file
 from igsr.capture.types import Points
 from igsr.errors import IgsrError
 
@@ -35,10 +36,10 @@ def read_point_cloud(path: Path) -> Points | None:
             is not finite.
     """
     try:
-        data = path.read_bytes()
-    except (OSError, ValueError) as error:
+        data = read_file(path)
+    except OSError as error:
         raise IgsrError(
-            f"{path} is missing or cannot be read; put the point cloud there"
+            f"{path} is missing or cannot be read ({error.strerror}); put the point cloud there"
         ) from error
     header, end, body = data.partition(b"end_header\n")
     if not end:

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from igsr._internal.choices import SPLITS, Split
+from igsr._internal.input_files import read_json
 from igsr.capture.image_files import is_file, photo_header
 from igsr.capture.mask_files import MaskFiles
 from igsr.capture.photos import DescribedCapture, Shot, rig_shots
@@ -125,10 +126,10 @@ def read_lens(path: Path) -> WideFisheye:
 
 def _read_json(path: Path) -> dict[str, Any]:
     try:
-        document = json.loads(path.read_bytes())
+        document = read_json(path)
     except OSError as error:
         raise IgsrError(f"{path} cannot be read ({error.strerror}); check it") from error
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         where = f" at line {error.lineno}" if isinstance(error, json.JSONDecodeError) else ""
         raise IgsrError(f"{path} is not valid JSON{where}; write it again") from error
     if not isinstance(document, dict):

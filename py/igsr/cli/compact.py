@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Annotated
 
 from igsr._internal.atomic_write import check_writable
+from igsr._internal.input_files import read_json
 from igsr._internal.json_file import write_json
 from igsr._internal.progress_bar import progress_bar
 from igsr.cli.error_messages import error_messages, nothing_written
@@ -145,7 +145,7 @@ def _decibels(option: str, text: str) -> float:
 def _reported_psnr(path: Path) -> float | None:
     """PSNR in the report of a fit; None if there is no report."""
     try:
-        psnr = json.loads(path.read_text(encoding="utf-8"))["psnr"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        psnr = read_json(path)["psnr"]
+    except (OSError, ValueError, KeyError, TypeError):
         return None
     return psnr if isinstance(psnr, float) and 0.0 < psnr < 100.0 else None

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+from igsr._internal.input_files import read_json
 from igsr._internal.progress_bar import progress_bar
 from igsr.cli.denoiser_option import DenoiserOption, chosen_denoiser
 from igsr.cli.error_messages import error_messages
@@ -92,7 +92,7 @@ def refine_command(
                 resume=resume,
                 progress=show,
             )
-    report = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    report = read_json(out / "report.json")
     if as_json:
         print_json(_summary(refined, report, out))
     else:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
@@ -14,6 +13,7 @@ from PIL import Image
 from igsr import _core
 from igsr._internal.atomic_write import atomic_write
 from igsr._internal.choices import Backend
+from igsr._internal.input_files import read_json
 from igsr._internal.json_file import write_json
 from igsr._internal.part_usage import Usage, total
 from igsr.capture import View
@@ -113,9 +113,9 @@ def report_of(
 def parts_so_far(out: Path) -> dict[str, Usage]:
     """Read the time and memory of each stage from the report in ``out``; {} if there is none."""
     try:
-        found = json.loads((out / "report.json").read_text(encoding="utf-8"))["parts"]
+        found = read_json(out / "report.json")["parts"]
         return {stage: Usage.of(found[stage]) for stage in get_args(Stage) if stage in found}
-    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
+    except (OSError, ValueError, KeyError, TypeError, OverflowError):
         return {}
 
 

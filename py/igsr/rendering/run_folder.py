@@ -5,7 +5,6 @@ The files are untrusted; malformed content is ignored.
 
 from __future__ import annotations
 
-import json
 import math
 import time
 import warnings
@@ -13,6 +12,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from igsr._internal.input_files import read_json
 from igsr.capture.load import describe_capture
 from igsr.capture.read_transforms import read_cameras
 from igsr.errors import IgsrError
@@ -30,8 +30,6 @@ PROGRESS = "progress.json"
 #: Age of the progress after which a run may have been interrupted. Bundle adjustment and scoring
 #: write no progress for minutes.
 MAX_SILENCE_S = 600.0
-#: Larger files are ignored, since they are read once a second.
-MAX_JSON_BYTES = 20_000_000
 MISSING = "–"
 
 
@@ -181,9 +179,7 @@ def _read(path: Path) -> dict[str, Any]:
 @lru_cache(maxsize=8)
 def _parsed(path: Path, *version: int) -> dict[str, Any]:
     try:
-        if not path.is_file() or path.stat().st_size > MAX_JSON_BYTES:
-            return {}
-        content = json.loads(path.read_bytes())
-    except (OSError, ValueError, RecursionError):
+        content = read_json(path)
+    except (OSError, ValueError):
         return {}
     return content if isinstance(content, dict) else {}
