@@ -134,7 +134,9 @@ def describe_colmap(
         name = posixpath.normpath(posixpath.join(prefix, image.name))
         mask = files.masks.of(file)
         shot = Shot(name, file, camera, lens, "train", mask, images_path, files.factor)
-        shot = replace(shot, depth_path=find_depth(path / DEPTHS, image.name.lstrip("/")))
+        # An absolute name or one with ".." could lead to the photo itself.
+        inside = posixpath.normpath(f"/{image.name}").lstrip("/")
+        shot = replace(shot, depth_path=find_depth(path / DEPTHS, inside))
         photos.append(_Photo(image, shot, rig))
     files.masks.warn_unless_used()
     frames = colmap_files.read_frames(frames_path) if is_file(frames_path) else []

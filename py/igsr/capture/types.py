@@ -20,6 +20,8 @@ from igsr.errors import IgsrError
 
 # Maximum of |R R^T - I|: numbers of four or five decimals stay below it, scale and shear do not.
 RIGID_TOLERANCE = 1e-3
+# Most columns or rows of a camera, for which floats and arrays have room.
+MAX_SIDE = 1 << 40
 # Maximum of |R R^T - I| of a rotation that was computed in float64.
 ROUNDING = 1e-13
 
@@ -55,6 +57,8 @@ class Camera(ArrayEquality):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
                 raise IgsrError(f"{name} is {value!r}; give a whole number of pixels, at least 1")
+            if value > MAX_SIDE:
+                raise IgsrError(f"{name} is more than {MAX_SIDE} pixels; correct it")
             object.__setattr__(self, name, int(value))
 
     def __hash__(self) -> int:

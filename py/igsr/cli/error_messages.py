@@ -70,6 +70,8 @@ def error_messages(interrupted: Callable[[], str] = lambda: "Interrupted.") -> I
     """
     try:
         with _signals_raise(), warnings.catch_warnings():
+            # Pillow warns of damaged EXIF and the like even if the pixels can be read.
+            warnings.filterwarnings("ignore", module="PIL")
             warnings.showwarning = lambda message, *rest: print_message(str(message))
             yield
     except typer.Exit:  # a RuntimeError

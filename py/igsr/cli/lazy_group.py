@@ -52,6 +52,11 @@ class LazyGroup(TyperGroup):
         """Import all commands; by name, in the order of the table."""
         return {name: load_command(name, entry) for name, entry in self.table.items()}
 
+    def make_context(self, *given: Any, **extra: Any) -> Any:
+        """Parse the options, print the help or the version; see ``TyperGroup``."""
+        with error_messages():
+            return super().make_context(*given, **extra)
+
     def invoke(self, ctx: Any) -> Any:
         """Run the command that was asked for; a missing extra is named. See ``TyperGroup``."""
         with error_messages():

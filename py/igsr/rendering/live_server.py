@@ -220,7 +220,7 @@ class _Handler(BaseHTTPRequestHandler):
                 raise KeyError(name)
         except IgsrError as error:
             self._answer_text(HTTPStatus.UNPROCESSABLE_ENTITY, str(error))
-        except KeyError:
+        except (KeyError, ValueError):  # int() refuses thousands of digits
             self._answer_text(HTTPStatus.NOT_FOUND, "This address does not exist.")
 
     def _is_open(self) -> bool:
