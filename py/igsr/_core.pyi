@@ -383,7 +383,7 @@ def camera_extent(centers: Float64) -> float:
 def morton_order(points: Float32) -> npt.NDArray[np.int64]:
     """Ids of points [N, 3] along Morton's curve, as the writers order splats."""
 
-def read_exr_depth(path: str) -> Float32:
+def read_exr_depth(path: str, most: int) -> Float32:
     """Read channel Z of an EXR file, or its only channel, float32 [H, W].
 
     Raises OSError or ValueError where the file cannot be read.

@@ -36,10 +36,14 @@ pub fn write_exr(
     Ok(py.detach(|| std::fs::write(path, bytes))?)
 }
 
-/// Reads channel Z of an EXR file, or its only channel, [H, W].
+/// Reads channel Z of an EXR file, or its only channel, [H, W], of at most `most` pixels.
 #[pyfunction]
-pub fn read_exr_depth<'py>(py: Python<'py>, path: &str) -> PyResult<Bound<'py, PyArray2<f32>>> {
+pub fn read_exr_depth<'py>(
+    py: Python<'py>,
+    path: &str,
+    most: usize,
+) -> PyResult<Bound<'py, PyArray2<f32>>> {
     let path = std::path::Path::new(path);
-    let (height, width, depth) = py.detach(|| io::read_exr_depth(path)).map_err(to_python)?;
+    let (height, width, depth) = py.detach(|| io::read_exr_depth(path, most)).map_err(to_python)?;
     PyArray1::from_vec(py, depth).reshape([height, width])
 }

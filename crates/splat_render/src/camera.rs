@@ -24,6 +24,9 @@ pub struct Camera {
     pub height: u32,
 }
 
+/// Bytes of a pixel while a picture is drawn: planes, and then colors and alpha.
+const PICTURE_BYTES: usize = 48;
+
 /// Checks a picture's size.
 pub(crate) fn check_size(width: u32, height: u32) -> Result<()> {
     if width == 0 || height == 0 || width > SIDE_MAX || height > SIDE_MAX {
@@ -33,6 +36,21 @@ pub(crate) fn check_size(width: u32, height: u32) -> Result<()> {
         ));
     }
     Ok(())
+}
+
+/// Checks that memory can hold a picture while it is drawn: an allocation that fails ends the process.
+pub(crate) fn check_memory(width: u32, height: u32) -> Result<()> {
+    let bytes = PICTURE_BYTES * width as usize * height as usize;
+    Vec::<u8>::new().try_reserve_exact(bytes).map_err(|_| {
+        Error::argument(
+            "width, height",
+            format!(
+                "need {:.1} GB for a picture of {width} x {height}, more than is free; give \
+                 smaller ones",
+                bytes as f64 / 1e9
+            ),
+        )
+    })
 }
 
 impl Camera {

@@ -11,8 +11,9 @@ use zune_jpeg::zune_core::options::DecoderOptions;
 
 /// Largest file that is read, bytes.
 const FILE_MAX: u64 = 256 << 20;
-/// Longest side that is read, pixels.
+/// Longest side and largest number of pixels that are read; a pixel takes 4 bytes.
 const SIDE_MAX: usize = 16_384;
+const PIXELS_MAX: usize = 1 << 26;
 
 #[derive(Debug, Clone)]
 pub struct Photo {
@@ -87,33 +88,41 @@ fn jpeg(bytes: &[u8]) -> JpegDecoder<Cursor<&[u8]>> {
     JpegDecoder::new_with_options(Cursor::new(bytes), options)
 }
 
+fn check_size(path: &Path, [width, height]: [usize; 2]) -> Result<()> {
+    if width.max(height) > SIDE_MAX || width * height > PIXELS_MAX {
+        let reason = format!("it has {width}x{height} pixels, more than {PIXELS_MAX}");
+        return Err(bad(path, reason));
+    }
+    Ok(())
+}
+
 pub fn read_photo(path: &Path) -> Result<Photo> {
     let bytes = bytes(path)?;
     if !is_png(&bytes) {
         let mut decoder = jpeg(&bytes);
-        let rgba = decoder.decode().map_err(|e| bad(path, e))?;
+        decoder.decode_headers().map_err(|e| bad(path, e))?;
         let (width, height) = decoder.dimensions().ok_or_else(|| bad(path, "it has no size"))?;
+        check_size(path, [width, height])?;
+        let rgba = decoder.decode().map_err(|e| bad(path, e))?;
         return Ok(Photo { size: [width, height], rgba });
     }
     let mut decoder = png::Decoder::new(Cursor::new(&bytes));
-    decoder.set_transformations(png::Transformations::normalize_to_color8());
+    decoder.set_transformations(
+        png::Transformations::normalize_to_color8() | png::Transformations::ALPHA,
+    );
     let mut reader = decoder.read_info().map_err(|e| bad(path, e))?;
     let size = [reader.info().width as usize, reader.info().height as usize];
-    if size.iter().any(|&side| side > SIDE_MAX) {
-        return Err(bad(path, format!("a side is longer than {SIDE_MAX}")));
-    }
+    check_size(path, size)?;
     let room = reader.output_buffer_size().ok_or_else(|| bad(path, "it is too large"))?;
     let mut data = vec![0; room];
     let frame = reader.next_frame(&mut data).map_err(|e| bad(path, e))?;
     data.truncate(frame.buffer_size());
     let rgba = match frame.color_type {
         png::ColorType::Rgba => data,
-        png::ColorType::Rgb => data.chunks_exact(3).flat_map(|p| [p[0], p[1], p[2], 255]).collect(),
-        png::ColorType::Grayscale => data.iter().flat_map(|&v| [v, v, v, 255]).collect(),
         png::ColorType::GrayscaleAlpha => {
             data.chunks_exact(2).flat_map(|p| [p[0], p[0], p[0], p[1]]).collect()
         }
-        png::ColorType::Indexed => return Err(bad(path, "its palette was not applied")),
+        _ => return Err(bad(path, "it was not converted")),
     };
     Ok(Photo { size, rgba })
 }
@@ -195,8 +204,16 @@ mod tests {
         }
         std::fs::remove_file(path).expect("clean");
         let wide = png(png::ColorType::Grayscale, png::BitDepth::Eight, &[1, 2]);
-        for (name, bytes) in [("empty", &b""[..]), ("text", b"no photo"), ("cut.png", &wide[..30])]
-        {
+        // Sides of 16 383 in the header.
+        let mut huge = bytes.to_vec();
+        let frame = huge.windows(2).position(|w| w == [0xff, 0xc0]).expect("a frame");
+        huge[frame + 5..frame + 9].copy_from_slice(&[0x3f, 0xff, 0x3f, 0xff]);
+        for (name, bytes) in [
+            ("empty", &b""[..]),
+            ("text", b"no photo"),
+            ("cut.png", &wide[..30]),
+            ("huge.jpg", &huge),
+        ] {
             let path = file(name, bytes);
             let error = read_photo(&path).expect_err(name).to_string();
             assert!(error.contains(name) && error.contains("a PNG or JPEG"), "{error}");

@@ -167,6 +167,17 @@ fn frames_need_an_empty_folder() {
     refused(&mut to(&folder.join("file")), &["file", "cannot be created"]);
 }
 
+#[cfg(target_os = "linux")]
+#[test]
+fn pictures_that_memory_cannot_hold_are_refused() {
+    let (folder, scene) = saved(&ball(20, 21, [0.5; 3]));
+    let mut command = std::process::Command::new("sh");
+    command.args(["-c", "ulimit -v 3000000 && exec \"$@\"", "sh"]);
+    command.arg(program().get_program()).arg(&scene);
+    command.args(["--backend", "cpu", "--size", "16384x16384", "--screenshot"]);
+    refused(command.arg(folder.join("a.png")), &["16384 x 16384", "GB"]);
+}
+
 #[cfg(unix)]
 #[test]
 fn pipes_and_devices_are_refused_at_once() {

@@ -12,6 +12,8 @@ import numpy.typing as npt
 from PIL import Image
 
 from igsr import _core
+from igsr._internal.input_files import open_file
+from igsr._internal.untrusted_npz import DAMAGE, stored_array
 from igsr.capture.downscaling import area_means
 from igsr.errors import IgsrError
 
@@ -31,6 +33,8 @@ _MAX_PIXELS_PER_BYTE = 10_000
 #: Folder of depths, for cameras that do not name their depth files.
 DEPTHS = "depths"
 _DEPTH_SUFFIXES = (".npy", ".exr", ".png", ".tif", ".tiff")
+#: Pixels that a depth may have even if its photo has fewer.
+MAX_FREE_DEPTH = 1 << 22
 # World units of a whole number, unless a capture gives them: depth cameras write millimeters.
 _WHOLE_NUMBER_UNIT = 1e-3
 # Depths outside these limits count as unknown; products with them would overflow float32.
@@ -75,7 +79,7 @@ def open_image(path: Path) -> Image.Image:
 
 def _formats(path: Path) -> tuple[str, ...]:
     """The formats that a file may have by its first bytes; phones name JPEGs .heic."""
-    with open(path, "rb") as file:
+    with open_file(path) as file:
         head = file.read(12)
     if head[4:8] != b"ftyp":
         return _FORMATS
@@ -209,7 +213,7 @@ def find_depth(folder: Path, name: str) -> Path | None:
     """Return a photo's depth file: its name, with or without suffix, and a suffix of depth."""
     stems = (name, posixpath.splitext(name)[0])
     files = (folder / f"{stem}{suffix}" for stem in stems for suffix in _DEPTH_SUFFIXES)
-    return next((file for file in files if file.is_file()), None)
+    return next(filter(is_file, files), None)
 
 
 def write_depth(path: Path, depth: Numbers) -> None:
@@ -218,7 +222,7 @@ def write_depth(path: Path, depth: Numbers) -> None:
     np.save(path, depth.astype(np.float32), allow_pickle=False)
 
 
-def read_depth(path: Path, unit: float | None) -> npt.NDArray[np.float32]:
+def read_depth(path: Path, unit: float | None, photo: tuple[int, int]) -> npt.NDArray[np.float32]:
     """Read a depth file.
 
     Args:
@@ -226,51 +230,63 @@ def read_depth(path: Path, unit: float | None) -> npt.NDArray[np.float32]:
             32-bit float TIFF. 0, negative and non-finite numbers mean that the depth is unknown.
         unit: world units of one number in the file; None is 0.001 for whole numbers and 1 for
             floats.
+        photo: width and height of the photo. Depth cameras have fewer pixels.
 
     Returns:
         Camera-space z [h, w] in world units, 0 for unknown depths.
 
     Raises:
-        IgsrError: the file cannot be read, or holds something else.
+        IgsrError: the file cannot be read, holds something else, or has more pixels than the photo
+            and ``MAX_FREE_DEPTH``.
     """
     suffix = path.suffix.lower()
-    stored = _npy(path) if suffix == ".npy" else _exr(path) if suffix == ".exr" else _picture(path)
+    read = _npy if suffix == ".npy" else _exr if suffix == ".exr" else _picture
+    stored = read(path, max(photo[0] * photo[1], MAX_FREE_DEPTH))
     if unit is None:
         unit = _WHOLE_NUMBER_UNIT if np.issubdtype(stored.dtype, np.integer) else 1.0
+    depth = np.zeros(stored.shape, np.float32)
     with np.errstate(over="ignore", invalid="ignore"):
-        depth = stored.astype(np.float64) * unit
-    is_known = np.isfinite(depth) & (depth > _MIN_DEPTH) & (depth < _MAX_DEPTH)
-    return np.where(is_known, depth, 0.0).astype(np.float32)
+        for row, numbers in zip(depth, stored, strict=True):  # by rows, to save memory
+            exact = numbers.astype(np.float64) * unit
+            is_known = (exact > _MIN_DEPTH) & (exact < _MAX_DEPTH)
+            row[is_known] = exact[is_known]
+    return depth
 
 
-def _picture(path: Path) -> Numbers:
+def _picture(path: Path, most: int) -> Numbers:
     with open_image(path) as image:
+        _check_pixels(path, image.width * image.height, most)
         load_pixels(image, path)
         if image.mode not in ("I", "I;16", "I;16B", "F"):
             raise IgsrError(
                 f"{path} is an 8-bit picture, which cannot hold depth; give a 16-bit PNG, .npy or "
                 "EXR"
             )
-        return np.asarray(image).astype(np.float32 if image.mode == "F" else np.int64)
+        return np.array(image)
 
 
-def _exr(path: Path) -> Numbers:
+def _check_pixels(path: Path, pixels: int, most: int) -> None:
+    if pixels > most:
+        raise IgsrError(f"{path} has {pixels} pixels, more than its photo; give smaller depth")
+
+
+def _exr(path: Path, most: int) -> Numbers:
     try:
-        return _core.read_exr_depth(str(path))
+        return _core.read_exr_depth(str(path), most)
     except (OSError, ValueError) as error:
         raise IgsrError(f"{path} cannot be read as depth: {error}") from error
 
 
-def _npy(path: Path) -> Numbers:
+def _npy(path: Path, most: int) -> Numbers:
     try:
-        # Mapped, so that a header that claims more than the file holds reserves no memory.
-        stored = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+        stored = stored_array(path)
+    except DAMAGE as error:
         raise IgsrError(f"{path} cannot be read as depth: {error}") from error
-    if not isinstance(stored, np.ndarray) or stored.dtype.kind not in "uif":
+    _check_pixels(path, stored.size, most)
+    if stored.dtype.kind not in "uif":
         raise IgsrError(f"{path} holds no numbers; give depth as a .npy array of [H, W]")
     if stored.ndim == 3 and 1 in (stored.shape[0], stored.shape[2]):
         stored = stored[0] if stored.shape[0] == 1 else stored[..., 0]
     if stored.ndim != 2 or 0 in stored.shape:
         raise IgsrError(f"{path} has shape {list(stored.shape)}; give depth as [H, W]")
-    return np.array(stored)
+    return stored

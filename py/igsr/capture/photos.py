@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -23,6 +24,7 @@ from igsr.capture.downscaling import (
 )
 from igsr.capture.exif import read_exif
 from igsr.capture.image_files import (
+    MAX_FREE_DEPTH,
     PhotoHeader,
     decoded,
     mask_of,
@@ -189,10 +191,20 @@ def shot_sizes(shots: list[Shot], headers: list[PhotoHeader]) -> PhotoSizes:
         channels=max((header.channels for header in headers), default=3),
         masked=any(shot.is_resampled or shot.mask_path is not None for shot in shots),
         depths=any(shot.depth_path is not None for shot in shots),
-        decoded=[header.size for header in headers],
+        decoded=[_decoded(shot, header) for shot, header in zip(shots, headers, strict=True)],
         views=[number for _, number in sorted(Counter(map(photo_of, shots)).items())],
         plain=[shot.path for shot in shots if shot.rig is None and shot.mask_path is None],
     )
+
+
+def _decoded(shot: Shot, header: PhotoHeader) -> tuple[int, int]:
+    """The largest that a photo, its mask and its depth may be; the two may have the full size."""
+    sizes = [header.size]
+    if shot.mask_path is not None or shot.depth_path is not None:
+        sizes.append((shot.camera.width, shot.camera.height))
+    if shot.depth_path is not None:
+        sizes.append((MAX_FREE_DEPTH, 1))
+    return max(sizes, key=math.prod)
 
 
 def _load_views(shots: list[Shot], headers: list[PhotoHeader], max_size: int | None) -> list[View]:
@@ -294,10 +306,10 @@ def _read_depth(shot: Shot, camera: Camera) -> np.ndarray | None:
     """The depth of a photo in the camera's pixels [H, W], from the nearest pixels of the file."""
     if shot.depth_path is None:
         return None
-    depth = read_depth(shot.depth_path, shot.depth_unit)
-    height, width = depth.shape
-    # Depth cameras have fewer pixels than photos, but the same field of view.
     full = shot.camera
+    depth = read_depth(shot.depth_path, shot.depth_unit, (full.width, full.height))
+    height, width = depth.shape
+    # Depth cameras have the same field of view as photos.
     difference = abs(width * full.height - height * full.width)
     rounding = max(full.width, full.height)
     if difference > max(DEPTH_ASPECT_TOLERANCE * height * full.width, rounding):

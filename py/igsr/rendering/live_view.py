@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from PIL import Image
-
+from igsr.capture.image_files import load_pixels, open_image
 from igsr.errors import IgsrError
 from igsr.rendering.live_models import LiveModel, live_models
 from igsr.rendering.run_folder import (
@@ -35,6 +34,8 @@ BLACK = (0.0, 0.0, 0.0)
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png")
 #: Maximum longest side of the photos that the page gets.
 MAX_PHOTO_SIDE_PX = 1600
+#: Maximum bytes of a photo while it is decoded: 4 per pixel, or 8 if it is converted.
+MAX_PHOTO_BYTES = 1 << 28
 
 
 #: Longest wait for cameras; thousands appear on the page later.
@@ -63,8 +64,9 @@ class LiveView:
         self._reading: threading.Thread | None = None
         self._start_reading = threading.Lock()
         self._packed: OrderedDict[tuple[str, str], bytes] = OrderedDict()
-        # Concurrent requests for a model pack it once.
+        # Concurrent requests for a model pack it once, and photos are decoded one at a time.
         self._packing = threading.Lock()
+        self._decoding = threading.Lock()
 
     @property
     def title(self) -> str:
@@ -103,7 +105,8 @@ class LiveView:
         path = photos[number] if 0 <= number < len(photos) else None
         if path is None:
             raise KeyError(number)
-        return _jpeg(path)
+        with self._decoding:
+            return _jpeg(path)
 
     def model(self, id: str, is_open: Callable[[], bool] = lambda: True) -> bytes:
         """Return a model for the page: the length of a JSON text (u32), the text, packed splats.
@@ -221,10 +224,14 @@ def _photo(folder: str, name: str) -> Path | None:
 def _jpeg(path: Path) -> bytes:
     size = (MAX_PHOTO_SIDE_PX, MAX_PHOTO_SIDE_PX)
     try:
-        with Image.open(path, formats=("JPEG", "PNG")) as photo:
+        with open_image(path) as photo:
             photo.draft("RGB", size)
-            small = photo.convert("RGB")
-        small.thumbnail(size)
+            copies = 1 if photo.mode == "RGB" and "progressive" not in photo.info else 2
+            if 4 * copies * photo.width * photo.height > MAX_PHOTO_BYTES:
+                raise IgsrError(f"it has {photo.width}x{photo.height} pixels, too many for a page")
+            load_pixels(photo, path)
+            small = photo if photo.mode == "RGB" else photo.convert("RGB")
+            small.thumbnail(size)
         file = io.BytesIO()
         small.save(file, format="JPEG", quality=90)
     # Pillow raises many kinds of errors for damaged or large files.

@@ -1,59 +1,69 @@
 //! The depth channel of an OpenEXR file.
 
-use std::io::Cursor;
+use std::io::{BufReader, Read, Seek};
 use std::path::Path;
 
-use ::exr::prelude::{FlatSamples, ReadChannels, ReadLayers, read};
+use ::exr::math::Vec2;
+use ::exr::meta::header::Header;
+use ::exr::prelude::{ReadChannels, ReadLayers, ReadSpecificChannel, read};
 
+use super::limits::EXR_BLOCK_MAX;
+use super::open_file;
 use crate::error::{Error, Result};
 
-/// Maximum number of pixels of a depth map.
-const PIXELS_MAX: usize = 1 << 28;
-
-/// Reads channel Z of an EXR file's largest layer, or its only channel. Returns height, width and `[H *
-/// W]` numbers, row-major.
-pub fn read_exr_depth(path: &Path) -> Result<(usize, usize, Vec<f32>)> {
-    let bytes = std::fs::read(path).map_err(|e| Error::file(path, e.to_string()))?;
-    decode(bytes)
+/// Reads channel Z of an EXR file's first layer that has it, or the only channel, of at most `most`
+/// pixels. Returns height, width and `[H * W]` numbers, row-major.
+pub fn read_exr_depth(path: &Path, most: usize) -> Result<(usize, usize, Vec<f32>)> {
+    decode(BufReader::new(open_file(path)?), most)
 }
 
-fn decode(bytes: Vec<u8>) -> Result<(usize, usize, Vec<f32>)> {
+fn decode(file: impl Read + Seek, most: usize) -> Result<(usize, usize, Vec<f32>)> {
     let bad = |reason: String| Error::argument("file", reason);
     // Headers first: one that claims too much reserves no memory.
-    let meta = ::exr::meta::MetaData::read_from_buffered(Cursor::new(&bytes), false)
+    let chunks = ::exr::block::read(file, false)
         .map_err(|e| bad(format!("is not an OpenEXR file ({e})")))?;
-    let pixels = meta.headers.iter().map(|header| header.layer_size.area()).max().unwrap_or(0);
-    if pixels > PIXELS_MAX {
-        return Err(bad(format!("has {pixels} pixels; the limit is {PIXELS_MAX}")));
+    let headers = chunks.headers();
+    let pixels = headers.iter().map(|header| header.layer_size.area()).max().unwrap_or(0);
+    if pixels > most {
+        return Err(bad(format!("has {pixels} pixels; the limit is {most}")));
     }
-    let image = read()
-        .no_deep_data()
-        .largest_resolution_level()
-        .all_channels()
-        .first_valid_layer()
-        .all_attributes()
-        .on_progress(|_| {})
-        .from_buffered(Cursor::new(bytes))
-        .map_err(|e| bad(format!("cannot be read ({e})")))?;
-    let (size, channels) = (image.layer_data.size, image.layer_data.channel_data.list);
-    let depth = match channels.iter().find(|channel| channel.name.eq("Z")) {
-        Some(depth) => depth,
-        None if channels.len() == 1 => &channels[0],
+    let block = headers.iter().map(Header::max_block_byte_size).max().unwrap_or(0);
+    if block > EXR_BLOCK_MAX {
+        return Err(bad(format!("has a block of {block} bytes; the limit is {EXR_BLOCK_MAX}")));
+    }
+    let channels = |header: &Header| header.channels.list.iter().map(|c| c.name.clone()).collect();
+    let layers: Vec<Vec<_>> = headers.iter().map(channels).collect();
+    let name = match layers.iter().flatten().find(|name| **name == *"Z") {
+        Some(name) => name.clone(),
+        None if layers[0].len() == 1 => layers[0][0].clone(),
         None => {
-            let names: Vec<String> = channels.iter().map(|c| c.name.to_string()).collect();
+            let names: Vec<String> = layers[0].iter().map(ToString::to_string).collect();
             return Err(bad(format!("has the channels {}, but no Z", names.join(", "))));
         }
     };
-    let values = match &depth.sample_data {
-        FlatSamples::F16(values) => values.iter().map(|v| v.to_f32()).collect(),
-        FlatSamples::F32(values) => values.clone(),
-        FlatSamples::U32(values) => values.iter().map(|&v| v as f32).collect(),
-    };
-    Ok((size.height(), size.width(), values))
+    // Values of one channel are kept.
+    let image = read()
+        .no_deep_data()
+        .largest_resolution_level()
+        .specific_channels()
+        .required(name)
+        .collect_pixels(
+            |size: Vec2<usize>, _| (size.width(), vec![0.0; size.area()]),
+            |(width, depth), at: Vec2<usize>, (z,): (f32,)| depth[at.y() * *width + at.x()] = z,
+        )
+        .first_valid_layer()
+        .all_attributes()
+        .on_progress(|_| {})
+        .from_chunks(chunks)
+        .map_err(|e| bad(format!("cannot be read ({e})")))?;
+    let size = image.layer_data.size;
+    Ok((size.height(), size.width(), image.layer_data.channel_data.pixels.1))
 }
 
 #[cfg(test)]
 mod tests {
+    use std::io::Cursor;
+
     use super::*;
     use crate::io::{ExrPicture, encode_exr};
 
@@ -64,9 +74,10 @@ mod tests {
         let picture =
             ExrPicture { width: 3, height: 2, color: &color, alpha: &alpha, depth: &depth };
         let bytes = encode_exr(&picture).unwrap();
-        assert_eq!(decode(bytes.clone()).unwrap(), (2, 3, depth));
+        assert_eq!(decode(Cursor::new(&bytes), 6).unwrap(), (2, 3, depth));
+        assert!(decode(Cursor::new(&bytes), 5).unwrap_err().to_string().contains("limit is 5"));
         for cut in [0, 3, 20, bytes.len() / 2, bytes.len() - 1] {
-            assert!(decode(bytes[..cut].to_vec()).is_err(), "{cut}");
+            assert!(decode(Cursor::new(&bytes[..cut]), 6).is_err(), "{cut}");
         }
     }
 }

@@ -1,5 +1,7 @@
 //! How much memory a file may ask for.
 
+use serde_json::Value;
+
 use super::bytes::Named;
 use crate::error::Result;
 use crate::sh;
@@ -8,6 +10,8 @@ use crate::sh;
 pub const SPLATS_MAX: u64 = 1 << 30;
 /// Largest file that is read into memory whole. A `.ply` is not, and may be larger.
 pub const FILE_MAX: u64 = 4 << 30;
+/// Most bytes of one block of an EXR file, which holds all channels of some rows or of a tile.
+pub const EXR_BLOCK_MAX: usize = 64 << 20;
 /// Splats in memory per byte of file. Files of real scenes unpack to 4 to 20 times their size.
 const UNPACKED_PER_BYTE: u64 = 64;
 /// Size that any file may unpack to, so that small scenes of equal splats can be read.
@@ -39,4 +43,27 @@ pub fn check_claim(named: &Named<'_>, count: u64, degree: u32, size: usize) -> R
         )));
     }
     Ok(count as usize)
+}
+
+/// Parses JSON of at most `most` values, or says why not. In memory a value may take 80 times its text.
+pub fn parse_json(text: &[u8], most: usize) -> std::result::Result<Value, String> {
+    if values(text) > most {
+        return Err(format!("holds JSON of more than {most} values"));
+    }
+    serde_json::from_slice(text).map_err(|e| format!("holds JSON that cannot be read ({e})"))
+}
+
+/// Upper bound on the number of values in a JSON text: each but the first follows a mark outside strings.
+fn values(text: &[u8]) -> usize {
+    let (mut count, mut quoted, mut escaped) = (1, false, false);
+    for byte in text {
+        match byte {
+            _ if escaped => escaped = false,
+            b'\\' if quoted => escaped = true,
+            b'"' => quoted = !quoted,
+            b',' | b'[' | b'{' if !quoted => count += 1,
+            _ => {}
+        }
+    }
+    count
 }

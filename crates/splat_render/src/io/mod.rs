@@ -32,6 +32,7 @@ pub use atomic::write_atomically;
 pub use exr::{ExrPicture, encode_exr, write_exr};
 pub use exr_depth::read_exr_depth;
 pub use format::Format;
+pub(crate) use limits::parse_json;
 pub use open::open_file;
 pub(crate) use prepare::{cut_degree, is_drawn};
 pub use rows::SplatRows;

@@ -12,12 +12,13 @@ use serde_json::{Map, Value, json};
 
 use super::cells::{Cells, Node};
 use crate::error::{Error, Result};
-use crate::io::open_file;
+use crate::io::{open_file, parse_json};
 
 /// Name of the file.
 pub const INDEX: &str = "lod-meta.json";
-/// Largest file that is read: a cell takes about 400 bytes, and JSON in memory many times its text.
+/// Largest file that is read, bytes, and most values in it: a cell takes about 400 and 40.
 const SIZE_MAX: u64 = 64 << 20;
+const VALUES_MAX: usize = 1 << 19;
 /// Most levels: each halves the splats, or more.
 const LEVELS_MAX: u64 = 32;
 
@@ -75,8 +76,7 @@ impl Manifest {
         if text.len() as u64 > SIZE_MAX {
             return Err(bad(format!("has more than {SIZE_MAX} bytes")));
         }
-        let json: Value =
-            serde_json::from_slice(&text).map_err(|e| bad(format!("is not JSON ({e})")))?;
+        let json = parse_json(&text, VALUES_MAX).map_err(bad)?;
         drop(text);
         parse(&json, file.parent().unwrap_or(Path::new(""))).map_err(bad)
     }

@@ -6,7 +6,7 @@ use super::{
     AdamState, AdamStep, DepthLoss, Exposure, ExposureGradients, Image, ImageGradients, Loss,
     ProjectOptions, Projected, ProjectedGradients, SplatGradients, check_lengths,
 };
-use crate::camera::{Camera, check_size};
+use crate::camera::{Camera, check_memory, check_size};
 use crate::error::{Error, Result};
 use crate::splats::SplatParams;
 use crate::target::{Target, TargetDepth};
@@ -31,6 +31,7 @@ pub trait Stages<T: Float> {
     /// Renders 2D splats over `background`.
     fn rasterize(&self, projected: &Projected<T>, background: [T; 3]) -> Result<Image<T>> {
         projected.validate()?;
+        check_memory(projected.width, projected.height)?;
         self.rasterize_unchecked(projected, background)
     }
 

@@ -3,7 +3,8 @@
 
 use std::path::Path;
 
-use splat_render::io::{parse_splats, read_splats};
+use splat_render::io::{parse_splats, read_exr_depth, read_splats};
+use splat_render::levels::{INDEX, Manifest};
 
 use crate::layouts::{gzip, ksplat, sog_with, spz_4};
 use crate::memory::peak_of;
@@ -193,4 +194,33 @@ fn json_never_takes_much_memory() {
     let text = format!(r#"{{"asset":{{"version":"2.0"}},"buffers":[{buffers}]}}"#);
     let name = folder.join("shared.gltf");
     assert!(refused(text.as_bytes(), name.to_str().unwrap()).contains("no splats"));
+    // 60 spellings of one file, 20 MB.
+    std::fs::write(folder.join("aaaaaa.bin"), vec![0; 20 << 20]).unwrap();
+    let spelled = |k: usize| (0..6).map(move |bit| ["a", "%61"][k >> bit & 1]).collect::<String>();
+    let buffer = |k| format!(r#"{{"byteLength":20971520,"uri":"{}.bin"}}"#, spelled(k));
+    let buffers: Vec<String> = (0..60).map(buffer).collect();
+    let text = format!(r#"{{"asset":{{"version":"2.0"}},"buffers":[{}]}}"#, buffers.join(","));
+    assert!(refused(text.as_bytes(), name.to_str().unwrap()).contains("no splats"));
+    // An index of levels that is all objects.
+    let objects = "{\"\":0},".repeat(5_000_000);
+    std::fs::write(folder.join(INDEX), format!("{{\"a\":[{objects}{{}}]}}")).unwrap();
+    let (result, peak) = peak_of(|| Manifest::read(&folder));
+    let error = result.unwrap_err().to_string();
+    assert!(error.contains("values") && peak < MEMORY_MAX, "{error} {peak}");
+}
+
+#[test]
+fn the_channels_of_an_exr_that_are_not_read_take_no_memory() {
+    use exr::prelude::{AnyChannel, AnyChannels, FlatSamples, Image, SmallVec, WritableImage};
+    let size = 1000;
+    let channel =
+        |name: String| AnyChannel::new(name.as_str(), FlatSamples::F32(vec![1.5; size * size]));
+    let names = (0..30).map(|k| format!("c{k}")).chain(["Z".to_owned()]);
+    let channels: SmallVec<_> = names.map(channel).collect();
+    let path = folder("exr").join("many.exr");
+    let image = Image::from_channels((size, size), AnyChannels::sort(channels));
+    image.write().to_file(&path).unwrap();
+    let (read, peak) = peak_of(|| read_exr_depth(&path, size * size));
+    assert_eq!(read.unwrap(), (size, size, vec![1.5; size * size]));
+    assert!(peak < 16 << 20, "{peak}");
 }

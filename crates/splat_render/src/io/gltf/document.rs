@@ -2,7 +2,7 @@
 
 use std::borrow::Cow;
 use std::collections::HashMap;
-use std::path::{Component, Path};
+use std::path::{Component, Path, PathBuf};
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
@@ -13,7 +13,7 @@ use crate::error::Result;
 use crate::io::bytes::{Bytes, Named, u32_at};
 use crate::io::{Format, limits, open_file};
 
-/// Most values in the JSON. In memory each may take 80 times its text; splats take a few hundred.
+/// Most values in the JSON; splats take a few hundred.
 const VALUES_MAX: usize = 1 << 18;
 
 /// A file's JSON and buffers.
@@ -30,16 +30,12 @@ impl<'a> Document<'a> {
     pub fn open(bytes: &'a [u8], format: Format, named: &Named<'a>) -> Result<Self> {
         let (text, binary) =
             if format == Format::Glb { split_glb(bytes, named)? } else { (bytes, None) };
-        if text.len() > TEXT_MAX || values(text) > VALUES_MAX {
-            return Err(named.bad(format!(
-                "has {} bytes of JSON with {} values, more than {TEXT_MAX} or {VALUES_MAX}; write \
-                 its splats alone, as .glb",
-                text.len(),
-                values(text)
-            )));
+        let alone = "write its splats alone, as .glb";
+        if text.len() > TEXT_MAX {
+            return Err(named.bad(format!("has more than {TEXT_MAX} bytes of JSON; {alone}")));
         }
-        let json: Value = serde_json::from_slice(text)
-            .map_err(|e| named.bad(format!("holds JSON that cannot be read ({e})")))?;
+        let json = limits::parse_json(text, VALUES_MAX)
+            .map_err(|reason| named.bad(format!("{reason}; {alone}")))?;
         let mut document = Self { json, buffers: Vec::new(), stores: Vec::new(), named: *named };
         let names =
             |value: &Value| value.as_str().filter(|&name| name != EXTENSION).map(String::from);
@@ -96,7 +92,7 @@ impl<'a> Document<'a> {
         &mut self,
         k: usize,
         binary: Option<&'a [u8]>,
-        files: &mut HashMap<String, usize>,
+        files: &mut HashMap<PathBuf, usize>,
     ) -> Result<usize> {
         let buffer = self.item("buffers", k)?;
         let length = number(buffer, "byteLength")
@@ -111,13 +107,18 @@ impl<'a> Document<'a> {
                     .map_err(|e| self.bad(format!("has buffers[{k}] that is not base64 ({e})")))?;
                 (next, Some(Cow::Owned(bytes)))
             }
-            (Some(uri), _, _) => match files.get(uri) {
-                Some(&place) => (place, None),
-                None => {
-                    files.insert(uri.to_owned(), next);
-                    (next, Some(Cow::Owned(self.neighbor(uri)?)))
+            (Some(uri), _, _) => {
+                // One file may have many spellings and links.
+                let path = self.neighbor(uri)?;
+                match files.get(&path) {
+                    Some(&place) => (place, None),
+                    None => {
+                        let read = self.read(&path, uri)?;
+                        files.insert(path, next);
+                        (next, Some(Cow::Owned(read)))
+                    }
                 }
-            },
+            }
             (None, _, Some(binary)) if k == 0 => (next, Some(Cow::Borrowed(binary))),
             _ => return Err(self.bad(format!("has buffers[{k}] without any bytes"))),
         };
@@ -131,9 +132,8 @@ impl<'a> Document<'a> {
         Ok(place)
     }
 
-    /// The bytes of a file in the same folder or below it.
-    fn neighbor(&self, uri: &str) -> Result<Vec<u8>> {
-        use std::io::Read;
+    /// The path, without links, of a file in the same folder or below it.
+    fn neighbor(&self, uri: &str) -> Result<PathBuf> {
         let name = percent_decoded(uri);
         let plain = Path::new(&name).components().all(|part| matches!(part, Component::Normal(_)));
         if name.contains([':', '\\', '\0']) || name.is_empty() || !plain {
@@ -142,28 +142,18 @@ impl<'a> Document<'a> {
             )));
         }
         let path = self.named.0.with_file_name(name);
+        Ok(path.canonicalize().unwrap_or(path))
+    }
+
+    fn read(&self, path: &Path, uri: &str) -> Result<Vec<u8>> {
+        use std::io::Read;
         let mut bytes = Vec::new();
-        open_file(&path)?
-            .take(limits::FILE_MAX)
+        open_file(path)?
+            .take(limits::FILE_MAX.saturating_sub(self.size() as u64))
             .read_to_end(&mut bytes)
             .map_err(|e| self.bad(format!("refers to {uri:?}, which cannot be read ({e})")))?;
         Ok(bytes)
     }
-}
-
-/// Upper bound on the number of values in a JSON text: each but the first follows a mark outside strings.
-fn values(text: &[u8]) -> usize {
-    let (mut count, mut quoted, mut escaped) = (1, false, false);
-    for byte in text {
-        match byte {
-            _ if escaped => escaped = false,
-            b'\\' if quoted => escaped = true,
-            b'"' => quoted = !quoted,
-            b',' | b'[' | b'{' if !quoted => count += 1,
-            _ => {}
-        }
-    }
-    count
 }
 
 fn split_glb<'a>(bytes: &'a [u8], named: &Named<'a>) -> Result<(&'a [u8], Option<&'a [u8]>)> {

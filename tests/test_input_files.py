@@ -1,0 +1,278 @@
+"""Files that a user or another file names may be pipes, devices, too large, or bombs."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import struct
+import subprocess
+import sys
+import zipfile
+import zlib
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scenes
+from capture_files import write_transforms
+from web_views import served, with_token
+
+import igsr
+from igsr._internal import input_files, peak_memory, untrusted_npz
+from igsr.blocks.tasks import load_splats
+from igsr.blocks.worker import read_progress
+from igsr.cameras.cameras_file import read_cameras_file
+from igsr.cameras.networks import config_of
+from igsr.capture import colmap_files
+from igsr.capture.image_files import MAX_FREE_DEPTH, open_image, read_depth
+from igsr.capture.load import describe_capture, look_at
+from igsr.capture.point_cloud import read_point_cloud
+from igsr.capture.read_transforms import read_cameras, read_lens
+from igsr.capture.write_transforms import write_cameras
+from igsr.cli import compact
+from igsr.errors import IgsrError
+from igsr.fitting.checkpoint import load_checkpoint
+from igsr.refinement.report import parts_so_far
+from igsr.rendering.run_folder import background_beside
+
+ROOT = Path(__file__).parents[1]
+MEMORY = 300_000_000
+
+#: Readers of JSON, by the name of a file for them.
+JSON_READERS = {
+    "cameras.json": read_cameras,
+    "lens.json": read_lens,
+    "transforms.json": describe_capture,
+    "page/report.json": lambda path: background_beside(path.with_name("scene.ply")),
+    "scores/report.json": compact._reported_psnr,
+    "parts/report.json": lambda path: parts_so_far(path.parent),
+    "progress.json": lambda path: read_progress(path.parent),
+    "config.json": lambda path: config_of(path.with_name("model.safetensors")),
+}
+READERS = {
+    **JSON_READERS,
+    "points.ply": read_point_cloud,
+    **{f"cameras.{kind}": colmap_files.read_cameras for kind in ("bin", "txt")},
+    **{f"images.{kind}": colmap_files.read_images for kind in ("bin", "txt")},
+    **{f"points3D.{kind}": colmap_files.read_points for kind in ("bin", "txt")},
+    **{f"frames.{kind}": colmap_files.read_frames for kind in ("bin", "txt")},
+    "count/images.bin": lambda path: colmap_files.image_count(path.parent),
+    **{f"depth{end}": lambda path: read_depth(path, None, (8, 8)) for end in (".npy", ".exr")},
+    "depth.png": lambda path: read_depth(path, None, (8, 8)),
+    "photo.png": open_image,
+    "cameras.npz": read_cameras_file,
+    "checkpoint.npz": load_checkpoint,
+    "splats.npz": load_splats,
+    **{f"scene{end}": igsr.Splats.load for end in (".ply", ".splat", ".spz", ".sog", ".glb")},
+}
+#: Files that igsr itself writes, or the system's, may be opened otherwise.
+OTHER_OPENERS = {
+    *("_internal/input_files.py", "_internal/peak_memory.py", "_internal/atomic_write.py"),
+    *("capture/memory_check.py", "rendering/scene_page.py", "rendering/scene_model.py"),
+}
+OPENING = re.compile(
+    r"\.read_bytes\(|\.read_text\(|np\.load\(|np\.fromfile\(|\"rb\"\)|json\.load\("
+)
+
+
+@pytest.fixture
+def in_time():
+    """Fails a test that waits for a pipe, instead of waiting with it."""
+
+    def late(*_):
+        raise AssertionError("the file is waited for")
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.alarm(10)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+def peak_of(work):
+    """The result of some work, and the bytes that it took at most."""
+    if not peak_memory.forget_peak():
+        pytest.skip("needs a resettable peak")
+    before = peak_memory.peak_bytes()
+    return work(), peak_memory.peak_bytes() - before
+
+
+def refused(read, path):
+    """A reader's sentence, or "" if it takes the file for missing."""
+
+    def attempt():
+        try:
+            found = read(path)
+        except IgsrError as error:
+            return str(error)
+        assert not found, found
+        return ""
+
+    sentence, peak = peak_of(attempt)
+    assert peak < MEMORY, f"{peak} bytes"
+    assert len(sentence) < 1000
+    return sentence
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_only_files_of_a_limited_size_are_read(tmp_path, in_time, name):
+    for kind in ("pipe", "device", "huge"):
+        path = tmp_path / kind / name
+        path.parent.mkdir(parents=True)
+        if kind == "pipe":
+            os.mkfifo(path)
+        elif kind == "device":
+            path.symlink_to("/dev/zero")
+        else:
+            path.touch()
+            os.truncate(path, input_files.MAX_BYTES + 1)  # takes no disk
+        refused(READERS[name], path)
+
+
+@pytest.mark.parametrize("name", JSON_READERS)
+def test_json_has_a_limited_number_of_values(tmp_path, name):
+    path = tmp_path / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text('{"frames": [' + '{"":{"":{}}},' * 1_000_000 + "{}]}")
+    refused(JSON_READERS[name], path)
+    path.write_text("[" * 100_000)
+    refused(JSON_READERS[name], path)
+
+
+def test_files_are_opened_in_one_place():
+    package = ROOT / "py" / "igsr"
+    for source in package.rglob("*.py"):
+        if source.relative_to(package).as_posix() not in OTHER_OPENERS:
+            found = OPENING.search(source.read_text(encoding="utf-8"))
+            assert found is None, f"{source}: open files by igsr._internal.input_files ({found[0]})"
+    for source in ROOT.glob("crates/*/src/**/*.rs"):
+        text = source.read_text(encoding="utf-8").partition("#[cfg(test)]")[0]
+        if source.name != "open.rs" and "levels/write.rs" not in source.as_posix():
+            assert not re.search(r"File::open\(|fs::read(_to_string)?\(", text), f"{source}: use open_file"
+    with pytest.raises(OSError, match="folder, a pipe or a device"):
+        input_files.open_file(ROOT)
+
+
+def png(width, height, depth=8, color=2):
+    """A PNG whose header claims a size, with no pixels."""
+
+    def chunk(kind, data):
+        checksum = struct.pack(">I", zlib.crc32(kind + data))
+        return struct.pack(">I", len(data)) + kind + data + checksum
+
+    header = struct.pack(">IIBBBBB", width, height, depth, color, 0, 0, 0)
+    # As many bytes as a picture of zeros, which the limit on pixels per byte allows.
+    data = zlib.compress(bytes(1000)) + bytes(width * height // 500)
+    return (
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+    )
+
+
+def npy(header):
+    return b"\x93NUMPY\x01\0" + struct.pack("<H", len(header)) + header.encode()
+
+
+HEADER = "{{'descr': '<f4', 'fortran_order': False, 'shape': {}, }}"
+BROKEN_ARRAYS = {
+    "signs": npy("-" * 9000 + "1"),
+    "brackets": npy("(" * 900),
+    "open": npy("{'descr': '<f4', 'shape': (8"),
+    "negative": npy(HEADER.format((-1, 8))) + bytes(100),
+    "vast": npy(HEADER.format((1 << 40, 1 << 40))) + bytes(100),
+    "objects": npy(HEADER.format((1,)).replace("<f4", "|O")) + bytes(8),
+    "empty": b"",
+    "text": b"no array",
+}
+
+
+@pytest.mark.parametrize("kind", BROKEN_ARRAYS)
+def test_broken_arrays_are_one_sentence(tmp_path, kind):
+    content = BROKEN_ARRAYS[kind]
+    (tmp_path / "depth.npy").write_bytes(content)
+    sentence = refused(lambda path: read_depth(path, None, (8, 8)), tmp_path / "depth.npy")
+    assert re.fullmatch(r"\S*depth.npy cannot be read as depth: [^\n]{1,80}", sentence)
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.writestr("settings.npy", content)
+    for read in (load_checkpoint, read_cameras_file, load_splats):
+        assert re.fullmatch(
+            r"[^\n]*a.npz cannot be read [^\n]{1,150}", refused(read, tmp_path / "a.npz")
+        )
+
+
+def test_arrays_in_the_order_of_fortran_are_read(tmp_path):
+    array = np.arange(12.0, dtype=np.float32).reshape(3, 4) + 1
+    np.save(tmp_path / "a.npy", np.asfortranarray(array))
+    assert np.array_equal(untrusted_npz.stored_array(tmp_path / "a.npy"), array)
+    assert np.array_equal(read_depth(tmp_path / "a.npy", 2.0, (4, 3)), 2 * array)
+
+
+@pytest.mark.parametrize("name", ["depth.png", "depth.npy"])
+def test_depth_is_no_larger_than_its_photo(tmp_path, name):
+    path = tmp_path / name
+    if name == "depth.png":
+        path.write_bytes(png(9000, 9000, 16, 0))
+    else:
+        np.save(path, np.zeros((3000, 3000), np.uint8))
+    sentence = refused(lambda path: read_depth(path, None, (48, 32)), path)
+    assert "more than its photo" in sentence
+    if name == "depth.npy":
+        assert read_depth(path, None, (3000, 3000)).shape == (3000, 3000)
+
+
+def test_depth_counts_in_the_memory_check(tmp_path):
+    np.save(tmp_path / "depth.npy", np.ones((32, 48), np.float32))
+    write_transforms(tmp_path)
+    before = look_at(tmp_path).needed_memory()
+    write_transforms(tmp_path, depth_file_path="depth.npy")
+    assert look_at(tmp_path).needed_memory() > before + 16 * MAX_FREE_DEPTH
+
+
+def test_photos_of_the_page_are_decoded_one_at_a_time_and_within_a_limit(tmp_path):
+    made = scenes.capture(views=1, size=8)
+    (tmp_path / "in.png").write_bytes(png(13000, 13000))
+    write_cameras(
+        tmp_path / "cameras.json",
+        [igsr.View("in.png", made.views[0].camera, "train", made.views[0].image)],
+    )
+    with served(tmp_path) as server, ThreadPoolExecutor(4) as pool:
+        asked = ["photo?number=0"] * 4
+        answers, peak = peak_of(lambda: list(pool.map(with_token, [server] * 4, asked)))
+        assert peak < MEMORY, f"{peak} bytes"
+        for status, content in answers:
+            assert status == 422
+            assert b"13000x13000 pixels, too many" in content
+        assert with_token(server, "photo?number=" + "9" * 5000)[0] == 404
+
+
+@pytest.mark.parametrize("digits", [13, 4000])
+def test_sizes_of_thousands_of_digits_are_refused(tmp_path, digits):
+    (tmp_path / "sparse").mkdir()
+    (tmp_path / "a.png").write_bytes(png(8, 8))
+    (tmp_path / "sparse/cameras.txt").write_text(f"1 PINHOLE {'9' * digits} 8 8 8 4 4\n")
+    (tmp_path / "sparse/images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n")
+    sentence = refused(igsr.load_capture, tmp_path)
+    assert "camera 1: width is more than" in sentence
+
+
+def test_a_photo_is_not_its_own_depth(tmp_path):
+    for folder in ("sparse", "images", "depths"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "depths/a.png").write_bytes(png(8, 8, 16, 0))
+    (tmp_path / "sparse/cameras.txt").write_text("1 PINHOLE 8 8 8 8 4 4\n")
+    for name in ("../depths/a.png", str(tmp_path / "depths/a.png")):
+        (tmp_path / "sparse/images.txt").write_text(f"1 1 0 0 0 0 0 0 1 {name}\n\n")
+        (shot,) = describe_capture(tmp_path).shots
+        assert shot.path.samefile(tmp_path / "depths/a.png")
+        assert shot.depth_path is None or not shot.depth_path.samefile(shot.path)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a full device")
+@pytest.mark.parametrize("words", ["--help", "--version"])
+def test_a_full_device_is_one_sentence(words):
+    with open("/dev/full", "wb") as full:
+        result = subprocess.run(
+            [sys.executable, "-m", "igsr.cli", *words.split()], stdout=full, stderr=subprocess.PIPE
+        )
+    assert (result.returncode, result.stderr) == (1, b"No space left on device.\n")
