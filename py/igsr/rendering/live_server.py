@@ -215,7 +215,7 @@ class _Handler(BaseHTTPRequestHandler):
             elif name == "model":
                 self._answer("application/octet-stream", view.model(query["id"], self._is_open))
             elif name == "photo" and query["number"].isdecimal():
-                self._answer("image/jpeg", view.photo(int(query["number"])))
+                self._answer("image/jpeg", view.photo(int(query["number"]), self._is_open))
             else:
                 raise KeyError(name)
         except IgsrError as error:

@@ -9,6 +9,7 @@ import os
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -35,11 +36,11 @@ PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png")
 #: Maximum longest side of the photos that the page gets.
 MAX_PHOTO_SIDE_PX = 1600
 #: Maximum bytes of a photo while it is decoded: 4 per pixel, or 8 if it is converted.
-MAX_PHOTO_BYTES = 1 << 28
-
-
+MAX_PHOTO_BYTES = 200_000_000
 #: Longest wait for cameras; thousands appear on the page later.
 READING_WAIT_S = 0.5
+#: How often a waiting request looks whether its connection is open.
+POLL_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -64,9 +65,10 @@ class LiveView:
         self._reading: threading.Thread | None = None
         self._start_reading = threading.Lock()
         self._packed: OrderedDict[tuple[str, str], bytes] = OrderedDict()
-        # Concurrent requests for a model pack it once, and photos are decoded one at a time.
+        # Concurrent requests for a model pack it once.
         self._packing = threading.Lock()
-        self._decoding = threading.Lock()
+        # Photos are decoded one at a time; each thread would keep memory for itself.
+        self._decoder = ThreadPoolExecutor(max_workers=1)
 
     @property
     def title(self) -> str:
@@ -99,14 +101,20 @@ class LiveView:
         """
         return self._current_surroundings().answer
 
-    def photo(self, number: int) -> bytes:
-        """Return the photo of a camera as JPEG; a KeyError if there is none."""
+    def photo(self, number: int, is_open: Callable[[], bool] = lambda: True) -> bytes:
+        """Return the photo of a camera as JPEG.
+
+        Raises a KeyError if there is none, and a ConnectionError as ``model``.
+        """
         photos = self._current_surroundings().photos
         path = photos[number] if 0 <= number < len(photos) else None
         if path is None:
             raise KeyError(number)
-        with self._decoding:
-            return _jpeg(path)
+        decoding = self._decoder.submit(_jpeg, path)
+        while not wait([decoding], timeout=POLL_S).done:
+            if not is_open() and decoding.cancel():
+                raise ConnectionError
+        return decoding.result()
 
     def model(self, id: str, is_open: Callable[[], bool] = lambda: True) -> bytes:
         """Return a model for the page: the length of a JSON text (u32), the text, packed splats.
@@ -189,7 +197,7 @@ def _json(
 @contextlib.contextmanager
 def _turn(lock: threading.Lock, is_open: Callable[[], bool]) -> Iterator[None]:
     """Wait for a lock, as long as the connection is open."""
-    while not lock.acquire(timeout=0.1):
+    while not lock.acquire(timeout=POLL_S):
         if not is_open():
             raise ConnectionError
     try:

@@ -7,7 +7,7 @@ use ::exr::math::Vec2;
 use ::exr::meta::header::Header;
 use ::exr::prelude::{ReadChannels, ReadLayers, ReadSpecificChannel, read};
 
-use super::limits::EXR_BLOCK_MAX;
+use super::limits::{EXR_BLOCK_MAX, EXR_MAX};
 use super::open_file;
 use crate::error::{Error, Result};
 
@@ -27,17 +27,26 @@ fn decode(file: impl Read + Seek, most: usize) -> Result<(usize, usize, Vec<f32>
     if pixels > most {
         return Err(bad(format!("has {pixels} pixels; the limit is {most}")));
     }
-    let block = headers.iter().map(Header::max_block_byte_size).max().unwrap_or(0);
-    if block > EXR_BLOCK_MAX {
-        return Err(bad(format!("has a block of {block} bytes; the limit is {EXR_BLOCK_MAX}")));
+    let bytes: usize = headers.iter().map(Header::total_pixel_bytes).sum();
+    let block_of = |header: &Header| {
+        let (block, layer) = (header.max_block_pixel_size(), header.layer_size);
+        let pixels = block.width().min(layer.width()) * block.height().min(layer.height());
+        pixels * header.channels.bytes_per_pixel
+    };
+    let block = headers.iter().map(block_of).max().unwrap_or(0);
+    if bytes > EXR_MAX || block > EXR_BLOCK_MAX {
+        return Err(bad(format!(
+            "has {bytes} bytes, and {block} in a block; the limits are {EXR_MAX} and \
+             {EXR_BLOCK_MAX}: save channel Z alone"
+        )));
     }
     let channels = |header: &Header| header.channels.list.iter().map(|c| c.name.clone()).collect();
     let layers: Vec<Vec<_>> = headers.iter().map(channels).collect();
-    let name = match layers.iter().flatten().find(|name| **name == *"Z") {
-        Some(name) => name.clone(),
-        None if layers[0].len() == 1 => layers[0][0].clone(),
-        None => {
-            let names: Vec<String> = layers[0].iter().map(ToString::to_string).collect();
+    let first = layers.first().map_or(&[][..], Vec::as_slice);
+    let name = match (layers.iter().flatten().find(|name| **name == *"Z"), first) {
+        (Some(name), _) | (None, [name]) => name.clone(),
+        _ => {
+            let names: Vec<String> = first.iter().map(ToString::to_string).collect();
             return Err(bad(format!("has the channels {}, but no Z", names.join(", "))));
         }
     };
