@@ -152,8 +152,9 @@ def test_files_are_opened_in_one_place():
         if source.name != "open.rs" and "levels/write.rs" not in source.as_posix():
             found = re.search(r"File::open\(|fs::read(_to_string)?\(", text)
             assert found is None, f"{source}: use open_file"
-    with pytest.raises(OSError, match="folder, a pipe or a device"):
-        input_files.open_file(ROOT)
+    for path in (ROOT, "/dev/zero"):
+        with pytest.raises(OSError, match="folder, a pipe or a device"):
+            input_files.open_file(path)
 
 
 def png(width, height, depth=8, color=2):

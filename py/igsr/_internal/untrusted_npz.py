@@ -34,8 +34,6 @@ _HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
 }
-#: Longest header of an array, in characters: long ones exhaust Python's parser.
-_MAX_HEADER = 1000
 
 
 def stored_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
@@ -72,8 +70,8 @@ def _read_array(file: IO[bytes], size: int) -> npt.NDArray[Any]:
     """The array in an open file of ``size`` bytes."""
     try:
         read_header = _HEADERS[np.lib.format.read_magic(file)]
-        shape, fortran, dtype = read_header(file, max_header_size=_MAX_HEADER)
-    except Exception as error:  # numpy parses it as Python
+        shape, fortran, dtype = read_header(file)
+    except Exception as error:  # numpy parses it as Python, whose parser runs out of memory
         raise ValueError("it has an array without a valid header") from error
     if dtype.hasobject or dtype.kind not in "biuf":
         raise ValueError("it holds no numbers")
