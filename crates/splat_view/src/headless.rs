@@ -17,6 +17,7 @@ use crate::display::Settings;
 use crate::model::Model;
 use crate::painter::{Painter, Shot, check_size};
 use crate::picture_files::{to_bytes, write_exr, write_png};
+use crate::print_line;
 use crate::scene_view::{background, cameras_of, first_camera, first_view, up};
 use crate::sources::find_sources;
 use crate::stage_times::STAGES;
@@ -101,7 +102,7 @@ impl Scene {
         }
         let (cameras, note) = cameras_of(arguments.cameras.as_deref(), Some(path))?;
         for note in model.notes.iter().chain(&note) {
-            eprintln!("{note}");
+            print_line(note);
         }
         let up = up(arguments, &cameras, &model);
         let fov = arguments.fov.map(f64::to_radians);

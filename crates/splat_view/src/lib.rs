@@ -49,10 +49,20 @@ pub fn run(words: impl IntoIterator<Item = OsString>) -> u8 {
         Ok(()) => 0,
         Err(error) => {
             let message = error.to_string();
-            eprintln!("{}.", message.trim_end_matches('.'));
+            print_line(&format!("{}.", message.trim_end_matches('.')));
             1
         }
     }
+}
+
+/// Prints a line to stderr. Terminal codes, which files and their names may hold, are escaped.
+fn print_line(text: &str) {
+    let is_code = |c: char| {
+        c.is_control()
+            || matches!(c, '\u{200e}'..='\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
+    };
+    let escaped = |c: char| if is_code(c) { c.escape_default().to_string() } else { c.to_string() };
+    eprintln!("{}", text.chars().map(escaped).collect::<String>());
 }
 
 fn asked(words: impl IntoIterator<Item = OsString>) -> Result<()> {

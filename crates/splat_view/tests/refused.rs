@@ -15,7 +15,10 @@ fn files_without_valid_splats_are_refused_in_one_message() {
     let folder = Folder::new();
     let header = "ply\nformat binary_little_endian 1.0\nelement vertex 4000000000\n\
                   property float x\nproperty float y\nproperty float z\nend_header\n";
-    let bad: [(&str, &[u8], &str); 5] = [
+    let codes =
+        b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty \x1b]0;t\x07 x\n";
+    let bad: [(&str, &[u8], &str); 6] = [
+        ("codes.ply", codes, r"\u{1b}]0;t\u{7}"),
         ("empty.ply", b"", "is empty"),
         ("short.ply", b"0123456789", "ply"),
         ("photo.ply", b"\xff\xd8\xff\xe0\x00\x10JFIF\x00\x01\x01\x00\x00\x01\x00\x01", "ply"),

@@ -217,6 +217,7 @@ pub fn refused_with(output: &Output, words: &[&str]) {
     assert_eq!(output.status.code(), Some(1), "{text}");
     assert_eq!(text.lines().count(), 1, "not one message: {text}");
     assert!(text.ends_with('.') && !text.contains("panicked"), "{text}");
+    assert!(!text.contains(char::is_control), "{text:?}");
     for word in words {
         assert!(text.contains(word), "{word} is not in: {text}");
     }
