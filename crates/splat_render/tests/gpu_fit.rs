@@ -353,6 +353,35 @@ fn running_out_of_room_for_pairs_changes_nothing() {
 }
 
 #[test]
+fn steps_after_one_without_room_are_done_again() {
+    let mut capture = capture(3, &[(16, 16), (128, 96)], 400);
+    for scale in capture.start.splats.scales.as_flattened_mut() {
+        *scale += 2.6;
+    }
+    // The small photo's pairs fit, the large one's do not: many steps later the host sees it.
+    let large = |step| step >= 20;
+    let input = |step| StepInput {
+        step,
+        camera_gradient: false,
+        ..input(&capture, 2 * step + u32::from(large(step)), 100.0)
+    };
+    let run = |mut device: GpuFit, has_room: bool| {
+        begin(&mut device, &capture);
+        if has_room {
+            device.step(&input(20)).unwrap();
+            begin(&mut device, &capture);
+        }
+        for step in 1..=70 {
+            device.step(&input(step)).unwrap();
+        }
+        (device.loss().unwrap(), device.download().unwrap())
+    };
+    let few = |gpu: Gpu| GpuFit::new(Arc::new(gpu)).with_color_wait(30);
+    let expected = run(few(gpu()), true);
+    assert!(run(few(gpu()), false) == expected, "steps that were done again gave other bits");
+}
+
+#[test]
 fn measured_steps_have_the_same_bits_and_a_time_for_each_command() {
     let capture = capture(2, &[(40, 33)], 120);
     let (expected, _) = run(&mut gpu_fit(), &capture, 4, 0.0);
@@ -401,13 +430,16 @@ fn steps_allocate_nothing_and_memory_grows_as_stated() {
         // The state on the device is read for density control and checkpoints, not in steps.
         fit.loss().unwrap();
         let (made, _) = gpu.made();
-        let writes = gpu.host_writes();
+        let (writes, waits) = (gpu.host_writes(), gpu.host_waits());
         for step in 11..=100 {
-            fit.step(&input(&capture, step, 0.0)).unwrap();
+            let input = input(&capture, step, 0.0);
+            fit.step(&StepInput { camera_gradient: false, ..input }).unwrap();
         }
-        // One a step, and one when waiting colors are brought up to date.
+        // A write in a step; a write and a wait when waiting colors are brought up to date, here for a
+        // higher SH degree.
         let written = gpu.host_writes() - writes;
         assert!((90..=92).contains(&written), "the host wrote {written} times in 90 steps");
+        assert_eq!(gpu.host_waits() - waits, 1);
         let (made_later, _) = gpu.made();
         assert_eq!(made_later, made, "steps 11 to 100 made buffers, bind groups or pipelines");
         bytes - before

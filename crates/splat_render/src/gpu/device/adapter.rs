@@ -183,6 +183,7 @@ impl Gpu {
             made: Default::default(),
             host_bytes: AtomicU64::new(0),
             host_writes: AtomicU64::new(0),
+            host_waits: AtomicU64::new(0),
             binding_limit,
             groups_max,
             build,

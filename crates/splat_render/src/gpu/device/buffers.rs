@@ -179,20 +179,47 @@ impl Gpu {
                 }
             });
         }
-        self.device
-            .poll(wgpu::PollType::wait_indefinitely())
-            .map_err(|e| self.error(&format!("did not finish ({e})")))?;
-        self.check()?;
-        let mut out = Vec::new();
-        for &(buffer, bytes) in buffers {
-            self.count_host(bytes);
-            let view = buffer
-                .get_mapped_range(..)
-                .map_err(|e| self.error(&format!("returned no results ({e})")))?;
-            out.push(view[..bytes as usize].to_vec());
-            drop(view);
-            buffer.unmap();
-        }
-        Ok(out)
+        self.host_waits.fetch_add(1, Ordering::Relaxed);
+        self.wait(wgpu::PollType::wait_indefinitely())?;
+        buffers.iter().map(|&(buffer, bytes)| self.mapped(buffer, bytes)).collect()
+    }
+
+    /// Runs commands and starts to bring back a [`Self::readable`] buffer.
+    pub(in crate::gpu) fn submit_read(
+        &self,
+        ops: &[Op],
+        buffer: &wgpu::Buffer,
+    ) -> Result<wgpu::SubmissionIndex> {
+        let submission = self.submit(&[ops])?;
+        // Errors show in finish_read. If the buffer is dropped before, there is none to report.
+        buffer.map_async(wgpu::MapMode::Read, .., |_| {});
+        Ok(submission)
+    }
+
+    /// Waits for no later work than a [`Self::submit_read`], and returns the buffer's first `bytes`.
+    pub(in crate::gpu) fn finish_read(
+        &self,
+        submission: wgpu::SubmissionIndex,
+        buffer: &wgpu::Buffer,
+        bytes: u64,
+    ) -> Result<Vec<u8>> {
+        self.wait(wgpu::PollType::Wait { submission_index: Some(submission), timeout: None })?;
+        self.mapped(buffer, bytes)
+    }
+
+    fn wait(&self, until: wgpu::PollType) -> Result<()> {
+        let failed = |e| self.error(&format!("did not finish ({e})"));
+        self.device.poll(until).map_err(failed)?;
+        self.check()
+    }
+
+    fn mapped(&self, buffer: &wgpu::Buffer, bytes: u64) -> Result<Vec<u8>> {
+        self.count_host(bytes);
+        let failed = |e| self.error(&format!("returned no results ({e})"));
+        let view = buffer.get_mapped_range(..).map_err(failed)?;
+        let data = view[..bytes as usize].to_vec();
+        drop(view);
+        buffer.unmap();
+        Ok(data)
     }
 }

@@ -216,7 +216,7 @@ impl Gpu {
     }
 
     /// Runs lists of prepared commands, without waiting for them.
-    pub(in crate::gpu) fn submit(&self, lists: &[&[Op]]) -> Result<()> {
+    pub(in crate::gpu) fn submit(&self, lists: &[&[Op]]) -> Result<wgpu::SubmissionIndex> {
         if self.submission_fails() {
             return Err(self.error("is out of memory"));
         }
@@ -224,8 +224,9 @@ impl Gpu {
         for ops in lists {
             Self::record(&mut encoder, ops);
         }
-        self.queue.submit([encoder.finish()]);
-        self.check()
+        let submission = self.queue.submit([encoder.finish()]);
+        self.check()?;
+        Ok(submission)
     }
 }
 

@@ -42,6 +42,7 @@ pub struct Gpu {
     made: [AtomicU64; 2],
     host_bytes: AtomicU64,
     host_writes: AtomicU64,
+    host_waits: AtomicU64,
     /// Most bytes that a storage binding may have.
     pub(super) binding_limit: u64,
     /// Most workgroups in one dimension of a dispatch.
@@ -233,6 +234,11 @@ impl Gpu {
     /// How many times the host wrote to a buffer so far.
     pub fn host_writes(&self) -> u64 {
         self.host_writes.load(Ordering::Relaxed)
+    }
+
+    /// How many times the host waited for all of the device's work so far.
+    pub fn host_waits(&self) -> u64 {
+        self.host_waits.load(Ordering::Relaxed)
     }
 
     fn count_host(&self, bytes: u64) {

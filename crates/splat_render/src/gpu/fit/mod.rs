@@ -2,8 +2,8 @@
 //! step is one submission of prepared commands.
 //!
 //! Buffers for (splat, tile) pairs have a capacity. A step that needs more detects it on the device and
-//! leaves the state unchanged, as do the steps after it. The host polls that flag from time to time,
-//! enlarges the buffers and repeats those steps, so that no step waits for a read-back.
+//! leaves the state unchanged, as do the steps after it. The host reads that flag some steps late,
+//! enlarges the buffers and repeats those steps, so that the device never waits for the host.
 //!
 //! Colors of splats that a step does not see wait ([`crate::fit_device::COLOR_WAIT`]).
 //!
@@ -45,7 +45,8 @@ use frame::{Frame, Parts, Uniforms};
 pub use plan::PlannedFit;
 use scene::{Scene, pair_buffers};
 
-/// Steps that may be under way before the host looks whether all pairs fitted.
+/// Steps in a batch. After each, the host asks whether all pairs fitted; it reads the answer after the next
+/// batch, or at once if it also reads sums of the steps.
 const STEPS_AHEAD: usize = 16;
 
 /// Offset of the status's overflow, bytes.
@@ -79,6 +80,10 @@ pub struct GpuFit {
     shares: Option<wgpu::Buffer>,
     /// Submitted, unconfirmed steps, each with the number of steps that colors waited for before it.
     pending: Vec<(StepInput, usize)>,
+    /// The overflow flag, copied after a batch of steps.
+    flag: wgpu::Buffer,
+    /// The submission that copies it, until it is read; it is about the first pending steps.
+    flagged: Option<wgpu::SubmissionIndex>,
     /// While pending steps are done again: the last of them that was submitted again.
     redone: Option<usize>,
     /// The steps that colors may wait for, pending ones included.
@@ -132,6 +137,11 @@ impl Inputs<'_> {
     }
 }
 
+/// Whether the host reads sums of the step.
+fn has_sums(input: &StepInput) -> bool {
+    input.exposure.is_some() || input.camera_gradient
+}
+
 impl GpuFit {
     /// A fitting device without photos or splats yet.
     pub fn new(gpu: Arc<Gpu>) -> Self {
@@ -142,6 +152,8 @@ impl GpuFit {
             exposure: gpu.uniform(&<ExposureUniform as bytemuck::Zeroable>::zeroed()),
             depth: gpu.uniform(&<DepthStep as bytemuck::Zeroable>::zeroed()),
             inputs: gpu.inputs(INPUT_BYTES),
+            flag: gpu.readable(size_of::<u32>() as u64),
+            flagged: None,
             gpu,
             photos: Vec::new(),
             frames: Vec::new(),
@@ -280,7 +292,9 @@ impl GpuFit {
         let lists: [&[Op]; 3] = [&copies, &frame.ops, &sums];
         match &mut self.times {
             Some(times) => times.push(self.gpu.submit_timed(&lists)?),
-            None => self.gpu.submit(&lists)?,
+            None => {
+                self.gpu.submit(&lists)?;
+            }
         }
         Ok(())
     }
@@ -346,6 +360,7 @@ impl GpuFit {
         if self.pending.is_empty() {
             return Ok(());
         }
+        self.read_flag()?;
         let (head, _) = self.status()?;
         let pending = std::mem::take(&mut self.pending);
         let first = match (head.overflow, self.redone) {
@@ -360,6 +375,33 @@ impl GpuFit {
             self.pending = pending;
             return Err(error);
         }
+        Ok(())
+    }
+
+    /// The overflow flag after the first pending steps, if it is on its way.
+    fn read_flag(&mut self) -> Result<Option<u32>> {
+        let Some(submission) = self.flagged.take() else { return Ok(None) };
+        let flag = self.gpu.finish_read(submission, &self.flag, size_of::<u32>() as u64)?;
+        Ok(Some(bytemuck::pod_read_unaligned(&flag)))
+    }
+
+    /// After every batch of steps: makes sure that the batch before has been done, while this one is under
+    /// way.
+    fn confirm(&mut self) -> Result<()> {
+        if !self.pending.len().is_multiple_of(STEPS_AHEAD) {
+            return Ok(());
+        }
+        if self.pending.iter().any(|(input, _)| has_sums(input)) {
+            return self.settle();
+        }
+        match self.read_flag()? {
+            None => {}
+            Some(0) => drop(self.pending.drain(..STEPS_AHEAD)),
+            Some(_) => return self.settle(),
+        }
+        let flag = (self.scene()?.bins.status.clone(), OVERFLOW_AT);
+        let copy = Op::Copy { from: flag, to: (self.flag.clone(), 0), bytes: 4 };
+        self.flagged = Some(self.gpu.submit_read(&[copy], &self.flag)?);
         Ok(())
     }
 
@@ -495,6 +537,7 @@ impl FitDevice for GpuFit {
 
     fn upload(&mut self, state: FitState) -> Result<()> {
         state.validate()?;
+        self.read_flag()?;
         self.pending.clear();
         self.redone = None;
         self.waiting.clear();
@@ -541,7 +584,8 @@ impl FitDevice for GpuFit {
     fn reset_opacities(&mut self) -> Result<()> {
         self.settle()?;
         let op = reset_op(&self.gpu, &self.scene()?.adam);
-        self.gpu.submit(&[&[op]])
+        self.gpu.submit(&[&[op]])?;
+        Ok(())
     }
 
     fn step(&mut self, input: &StepInput) -> Result<()> {
@@ -549,8 +593,9 @@ impl FitDevice for GpuFit {
             let frame = &self.frames[photo.frame];
             (frame.width, frame.height)
         }))?;
-        // Steps that are to be done again come first.
-        if self.redone.is_some() || self.pending.len() >= STEPS_AHEAD {
+        // Steps that are to be done again come first; sums are kept for one batch.
+        let most = if has_sums(input) { STEPS_AHEAD } else { 2 * STEPS_AHEAD };
+        if self.redone.is_some() || self.pending.len() >= most {
             self.settle()?;
         }
         let adam = input.adam();
@@ -562,7 +607,7 @@ impl FitDevice for GpuFit {
         self.enqueue(input, self.pending.len(), waiting, false)?;
         self.pending.push((*input, waiting));
         self.waiting.add(&adam);
-        if self.pending.len() >= STEPS_AHEAD { self.settle() } else { Ok(()) }
+        self.confirm()
     }
 
     fn camera_gradients(&mut self) -> Result<Vec<CameraGradient>> {
