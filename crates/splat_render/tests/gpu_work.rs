@@ -18,18 +18,18 @@ fn plan() -> PlannedFit {
 }
 
 #[test]
-fn a_step_is_24_dispatches() {
+fn a_step_is_23_dispatches() {
     let sort = |passes: usize| ["sort_count", "sort_place"].repeat(passes);
     let expected = [
         vec!["project"],
         sort(4),
-        vec!["tile_counts", "scan_sums", "scan_apply", "emit"],
+        vec!["tile_counts", "scan_apply", "emit"],
         sort(2),
         vec!["ranges", "rasterize", "loss_slopes", "loss_gradient"],
         vec!["rasterize_backward", "rasterize_backward_sum", "fit_geometry"],
     ]
     .concat();
-    assert_eq!(expected.len(), 24);
+    assert_eq!(expected.len(), 23);
     assert_eq!(plan().step(), expected);
 }
 

@@ -5,13 +5,13 @@ struct Style {
     world_to_camera: array<vec4<f32>, 3>,
     // The picture in pixels.
     size: vec2<f32>,
-    splats: u32,
     // As Display in display.rs.
     display: u32,
     // Depths are divided by it, so that half floats hold them.
     depth_unit: f32,
     // Radius of points, in pixels.
     radius: f32,
+    unused: f32,
 }
 
 const SPLATS = 0u;
@@ -27,6 +27,8 @@ const ELLIPSE = 1.5;
 @group(0) @binding(1) var<storage, read> splats2d: array<Splat2d>;
 @group(0) @binding(2) var<storage, read> order: array<u32>;
 @group(0) @binding(3) var<storage, read> geometry: array<f32>;
+// Vertices and instances of the draw of all splats in `order`.
+@group(0) @binding(4) var<storage, read> quads: array<u32, 4>;
 
 struct Corner {
     @builtin(position) position: vec4<f32>,
@@ -61,12 +63,12 @@ fn normal(i: u32) -> vec3<f32> {
 
 @vertex
 fn corner(@builtin(vertex_index) vertex: u32, @builtin(instance_index) instance: u32) -> Corner {
-    let i = order[style.splats - 1u - instance];
+    let i = order[quads[1] - 1u - instance];
     let splat = splats2d[i];
     var out: Corner;
     // Four equal corners cover nothing.
     out.position = vec4(0.0, 0.0, 0.0, 1.0);
-    if all(splat.radii == vec2(0.0)) || splat.opacity <= ALPHA_MIN {
+    if splat.opacity <= ALPHA_MIN {
         return out;
     }
     let side = vec2(f32(vertex & 1u), f32(vertex >> 1u)) * 2.0 - 1.0;

@@ -18,11 +18,10 @@ pub const CANVAS: wgpu::TextureFormat = wgpu::TextureFormat::Rgba16Float;
 struct Style {
     world_to_camera: [[f32; 4]; 3],
     size: [f32; 2],
-    splats: u32,
     display: u32,
     depth_unit: f32,
     radius: f32,
-    padding: [f32; 2],
+    unused: [f32; 3],
 }
 
 #[derive(Debug)]
@@ -48,6 +47,20 @@ impl Drawable {
         };
         (relative_to(*camera, self.origin), options)
     }
+
+    /// Sets how the next submission draws it from a camera relative to its origin.
+    pub fn set_style(&self, gpu: &Gpu, camera: &Camera, settings: &Settings, depth_unit: f32) {
+        let row = |i: usize| camera.viewmat.row(i).to_array().map(|v| v as f32);
+        let style = Style {
+            world_to_camera: [row(0), row(1), row(2)],
+            size: [camera.width as f32, camera.height as f32],
+            display: settings.display as u32,
+            depth_unit,
+            radius: settings.radius,
+            unused: [0.0; 3],
+        };
+        gpu.queue().write_buffer(&self.style, 0, bytemuck::bytes_of(&style));
+    }
 }
 
 #[derive(Debug)]
@@ -66,6 +79,7 @@ impl Blending {
                 storage(1),
                 storage(2),
                 storage(3),
+                storage(4),
             ],
             wgpu::PrimitiveTopology::TriangleStrip,
             wgpu::ColorTargetState {
@@ -79,7 +93,8 @@ impl Blending {
     pub fn upload(&self, gpu: &Gpu, file: &SplatFile) -> Result<Drawable> {
         let resident = ResidentSplats::new(gpu, &file.splats.params(file.splats.sh_degree))?;
         let style = uniform::<Style>(gpu);
-        let buffers = [&style, resident.splats2d(), resident.order(), resident.geometry()];
+        let buffers =
+            [&style, resident.splats2d(), resident.order(), resident.geometry(), resident.quads()];
         let bindings = self.0.bind(gpu, buffers.map(wgpu::Buffer::as_entire_binding));
         gpu.check()?;
         Ok(Drawable {
@@ -114,17 +129,7 @@ impl Blending {
             &seen,
             [stamps.compute(PROJECT), stamps.compute(SORT)],
         )?;
-        let row = |i: usize| camera.viewmat.row(i).to_array().map(|v| v as f32);
-        let style = Style {
-            world_to_camera: [row(0), row(1), row(2)],
-            size: [camera.width as f32, camera.height as f32],
-            splats: model.resident.len(),
-            display: settings.display as u32,
-            depth_unit,
-            radius: settings.radius,
-            padding: [0.0; 2],
-        };
-        gpu.queue().write_buffer(&model.style, 0, bytemuck::bytes_of(&style));
+        model.set_style(gpu, &camera, settings, depth_unit);
         let mut pass = encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
             label: Some("blend"),
             color_attachments: &[Some(wgpu::RenderPassColorAttachment {
@@ -139,11 +144,21 @@ impl Blending {
             timestamp_writes: stamps.render(BLEND),
             ..Default::default()
         });
-        if !model.resident.is_empty() && begin < end {
+        if begin < end {
             pass.set_scissor_rect(begin, 0, end - begin, camera.height);
-            self.0.draw(&mut pass, &model.bindings, 4, model.resident.len());
+            self.draw(&mut pass, model, (model.resident.quads(), 0));
         }
         Ok(())
+    }
+
+    /// Draws a model, whose style is set, by the arguments at an offset of a buffer.
+    pub fn draw(
+        &self,
+        pass: &mut wgpu::RenderPass<'_>,
+        model: &Drawable,
+        arguments: (&wgpu::Buffer, u64),
+    ) {
+        self.0.draw_indirect(pass, &model.bindings, arguments);
     }
 }
 

@@ -27,7 +27,7 @@ impl Display {
 /// Renderer of the display `Splats`; blending draws the remaining displays.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Drawing {
-    /// The rasterizer on software adapters, for which it is faster, else blending.
+    /// The rasterizer on software adapters, else the renderer of the fastest frames.
     #[default]
     Auto,
     Rasterizer,

@@ -13,7 +13,8 @@ use splat_render::{Camera, Error, Image, ProjectOptions, Projected, Result, Stag
 
 use crate::arguments::{Arguments, Backend};
 use crate::detail::view;
-use crate::display::Settings;
+use crate::display::{Drawing, Settings};
+use crate::drawing_choice::TIMED;
 use crate::model::Model;
 use crate::painter::{Painter, Shot, check_size};
 use crate::picture_files::{to_bytes, write_exr, write_png};
@@ -199,8 +200,10 @@ fn time(scene: &Scene, frames: u32) -> Result<()> {
     let target = target.create_view(&Default::default());
     let mut stages: Vec<[f32; STAGES.len()]> = Vec::new();
     let mut whole = Vec::new();
-    // The first frame compiles.
-    for i in 0..=frames {
+    // The first frames compile, and choose the renderer.
+    let chooses = scene.settings.drawing == Drawing::Auto && !gpu.is_software();
+    let first = if chooses { 1 + 2 * TIMED as u32 } else { 1 };
+    for i in 0..first + frames {
         let started = Instant::now();
         let camera = scene.turned(f64::from(i));
         let shot = scene.shot(camera, &model);
@@ -213,7 +216,7 @@ fn time(scene: &Scene, frames: u32) -> Result<()> {
             .poll(wgpu::PollType::wait_indefinitely())
             .map_err(|e| Error::Device(format!("{} did not finish ({e})", gpu.name())))?;
         gpu.check()?;
-        if i > 0 {
+        if i >= first {
             whole.push(started.elapsed().as_secs_f32() * 1e3);
             stages.extend(painter.times.latest());
         } else {

@@ -10,6 +10,7 @@ mod checkpoint;
 mod composing;
 mod detail;
 mod display;
+mod drawing_choice;
 mod gestures;
 mod headless;
 mod loader;

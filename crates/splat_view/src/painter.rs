@@ -10,6 +10,7 @@ use splat_render::{Camera, Error, Result};
 use crate::blending::{Blending, Drawable};
 use crate::composing::{Canvases, Composing, Look};
 use crate::display::{Display, Drawing, Settings};
+use crate::drawing_choice::DrawingChoice;
 use crate::rasterizing::{PictureBuffers, Rasterizing};
 use crate::stage_times::{
     BIN, BLEND, CANVAS, COMPOSE, PANEL, PROJECT, RASTERIZE, SECOND, SORT, STAGES, StageTimes,
@@ -64,6 +65,7 @@ pub struct Painter {
     canvases: Option<Canvases>,
     /// The rasterizer's buffers for a canvas; both sides use them in turn.
     buffers: Option<PictureBuffers>,
+    choice: DrawingChoice,
     pub times: StageTimes,
 }
 
@@ -76,6 +78,7 @@ impl Painter {
             to_picture: Composing::new(&gpu, PICTURE),
             canvases: None,
             buffers: None,
+            choice: DrawingChoice::new(),
             times: StageTimes::new(&gpu),
             gpu,
         };
@@ -94,9 +97,14 @@ impl Painter {
         shot: &Shot<'_>,
         target: &wgpu::TextureView,
     ) -> Result<Written> {
-        self.fit(shot)?;
+        if let Some(times) = self.times.new_times() {
+            let frame = times.iter().sum::<f32>() - times[PANEL];
+            let rasterized = times[RASTERIZE] + times[SECOND + RASTERIZE];
+            self.choice.timed(rasterized > 0.0, frame);
+        }
+        let rasterizes = self.fit(shot)?;
         self.times.begin(&self.gpu);
-        let mut written = self.draw(encoder, shot, true)?;
+        let mut written = self.draw(encoder, shot, rasterizes, true)?;
         let Some(canvases) = &self.canvases else { return Ok(written) };
         let compose = self.times.stamps(COMPOSE).render(0);
         written[COMPOSE] = compose.is_some();
@@ -110,7 +118,7 @@ impl Painter {
 
     /// Draws a frame and returns its RGBA bytes.
     pub fn picture(&mut self, shot: &Shot<'_>) -> Result<Vec<u8>> {
-        self.fit(shot)?;
+        let rasterizes = self.fit(shot)?;
         let [width, height] = [shot.camera.width, shot.camera.height];
         let texture = self.gpu.device().create_texture(&wgpu::TextureDescriptor {
             label: Some("picture"),
@@ -123,7 +131,7 @@ impl Painter {
             view_formats: &[],
         });
         let mut encoder = self.gpu.device().create_command_encoder(&Default::default());
-        self.draw(&mut encoder, shot, false)?;
+        self.draw(&mut encoder, shot, rasterizes, false)?;
         let Some(canvases) = &self.canvases else { return Ok(Vec::new()) };
         let target = texture.create_view(&Default::default());
         self.to_picture.record(&self.gpu, &mut encoder, canvases, &look(shot), &target, None);
@@ -143,7 +151,7 @@ impl Painter {
         let shot = Shot { settings: &settings, ..*shot };
         self.fit(&shot)?;
         let mut encoder = self.gpu.device().create_command_encoder(&Default::default());
-        self.draw(&mut encoder, &shot, false)?;
+        self.draw(&mut encoder, &shot, false, false)?;
         let Some(canvases) = &self.canvases else { return Ok(None) };
         let is_right = shot.right.is_some() && pixel[0] >= column(&shot);
         let readable = self.gpu.readable(8);
@@ -157,8 +165,8 @@ impl Painter {
         Ok((alpha > 0.5).then(|| depth / alpha * f64::from(unit(&shot))))
     }
 
-    /// Allocates the canvases and rasterizer buffers that the frame needs.
-    fn fit(&mut self, shot: &Shot<'_>) -> Result<()> {
+    /// Allocates the canvases and rasterizer buffers that the frame needs; whether the rasterizer draws it.
+    fn fit(&mut self, shot: &Shot<'_>) -> Result<bool> {
         let size = [shot.camera.width, shot.camera.height];
         let two = shot.right.is_some();
         let fits = self.canvases.as_ref().is_some_and(|canvases| {
@@ -171,23 +179,26 @@ impl Painter {
             self.gpu.check()?;
             self.canvases = Some(canvases);
         }
-        if self.rasterizes(shot.settings) && self.buffers.as_ref().is_none_or(|r| r.size != size) {
+        let rasterizes = self.rasterizes(shot);
+        if rasterizes && self.buffers.as_ref().is_none_or(|r| r.size != size) {
             // Free the old one's memory first.
             self.buffers = None;
             match self.rasterizing.buffers(&self.gpu, size) {
                 Ok(buffers) => self.buffers = Some(buffers),
                 Err(error) if shot.settings.drawing == Drawing::Rasterizer => return Err(error),
                 // Then the blending unit draws, which needs no such buffers.
-                Err(_) => {}
+                Err(_) => self.choice.rule_out_rasterizer(),
             }
         }
-        Ok(())
+        Ok(rasterizes)
     }
 
-    fn rasterizes(&self, settings: &Settings) -> bool {
-        settings.display == Display::Splats
-            && match settings.drawing {
-                Drawing::Auto => self.gpu.is_software(),
+    fn rasterizes(&mut self, shot: &Shot<'_>) -> bool {
+        let splats: u32 = [shot.left, shot.right].iter().flatten().map(|m| m.splats().len()).sum();
+        let pixels = shot.camera.width * shot.camera.height;
+        shot.settings.display == Display::Splats
+            && match shot.settings.drawing {
+                Drawing::Auto => self.gpu.is_software() || self.choice.rasterizes(splats, pixels),
                 Drawing::Rasterizer => true,
                 Drawing::Blending => false,
             }
@@ -198,10 +209,10 @@ impl Painter {
         &mut self,
         encoder: &mut wgpu::CommandEncoder,
         shot: &Shot<'_>,
+        rasterizes: bool,
         is_timed: bool,
     ) -> Result<Written> {
         let mut written = [false; STAGES.len()];
-        let rasterizes = self.rasterizes(shot.settings);
         let Some(canvases) = &self.canvases else { return Ok(written) };
         let middle = if shot.right.is_some() { column(shot) } else { canvases.size[0] };
         let sides = [(shot.left, [0, middle]), (shot.right, [middle, canvases.size[0]])];
@@ -221,12 +232,25 @@ impl Painter {
                 Some(buffers) => {
                     let (camera, settings) = (&shot.camera, shot.settings);
                     let drawn = self.rasterizing.draw(
-                        &self.gpu, model, buffers, camera, settings, canvas, columns, &stamps,
+                        &self.gpu,
+                        &self.blending,
+                        model,
+                        buffers,
+                        camera,
+                        settings,
+                        canvas,
+                        columns,
+                        &stamps,
                     );
                     match drawn {
                         Err(error) if settings.drawing == Drawing::Rasterizer => return Err(error),
-                        // Too many splats in a tile: the blending unit draws them.
-                        drawn => drawn.is_ok(),
+                        // No memory for the pairs: the blending unit draws them.
+                        drawn => {
+                            if drawn.is_err() {
+                                self.choice.rule_out_rasterizer();
+                            }
+                            drawn.is_ok()
+                        }
                     }
                 }
             };

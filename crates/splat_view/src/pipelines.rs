@@ -70,6 +70,18 @@ impl Pipeline {
         pass.draw(0..vertices, 0..instances);
     }
 
+    /// Draws as the four numbers at an offset in `arguments` say.
+    pub fn draw_indirect(
+        &self,
+        pass: &mut wgpu::RenderPass<'_>,
+        bindings: &wgpu::BindGroup,
+        (arguments, offset): (&wgpu::Buffer, u64),
+    ) {
+        pass.set_pipeline(&self.pipeline);
+        pass.set_bind_group(0, bindings, &[]);
+        pass.draw_indirect(arguments, offset);
+    }
+
     /// A group of bindings, of `resources` in their order.
     pub fn bind<const N: usize>(
         &self,

@@ -4,7 +4,7 @@ use bytemuck::{Pod, Zeroable};
 use splat_render::gpu::{Gpu, ResidentPicture, ResidentView};
 use splat_render::{Camera, Result};
 
-use crate::blending::{CANVAS, Drawable};
+use crate::blending::{Blending, CANVAS, Drawable};
 use crate::display::Settings;
 use crate::pipelines::{Pipeline, storage_layout, uniform, uniform_layout};
 use crate::stage_times::{BIN, CANVAS as CANVAS_STAGE, PROJECT, RASTERIZE, SORT, Stamps};
@@ -53,10 +53,12 @@ impl Rasterizing {
         Ok(PictureBuffers { size, picture, place, bindings })
     }
 
-    /// Draws a model onto columns `begin..end` of a canvas and submits the work.
+    /// Draws a model onto columns `begin..end` of a canvas and submits the work. Blending draws it if there
+    /// was no room for its pairs.
     pub fn draw(
         &self,
         gpu: &Gpu,
+        blending: &Blending,
         model: &Drawable,
         buffers: &mut PictureBuffers,
         camera: &Camera,
@@ -77,6 +79,7 @@ impl Rasterizing {
             begin..end,
             [PROJECT, SORT, BIN, RASTERIZE].map(|stage| stamps.compute(stage)),
         )?;
+        model.set_style(gpu, &camera, settings, 1.0);
         let columns = Place { begin, width: end - begin };
         gpu.queue().write_buffer(&buffers.place, 0, bytemuck::bytes_of(&columns));
         let mut pass = encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
@@ -94,9 +97,12 @@ impl Rasterizing {
             ..Default::default()
         });
         pass.set_scissor_rect(begin, 0, end - begin, camera.height);
-        self.0.draw(&mut pass, &buffers.bindings, 3, 1);
+        let (arguments, [picture, quads]) = ResidentPicture::draws(model.splats());
+        self.0.draw_indirect(&mut pass, &buffers.bindings, (arguments, picture));
+        blending.draw(&mut pass, model, (arguments, quads));
         drop(pass);
         gpu.queue().submit([encoder.finish()]);
+        buffers.picture.submitted();
         gpu.check()
     }
 }

@@ -50,6 +50,7 @@ const ALIGNMENT: u64 = wgpu::QUERY_RESOLVE_BUFFER_ALIGNMENT;
 pub struct StageTimes {
     queries: Option<Queries>,
     last: Option<[f32; STAGES.len()]>,
+    is_new: bool,
 }
 
 #[derive(Debug)]
@@ -123,7 +124,7 @@ impl StageTimes {
                 is_pending: false,
                 is_mapped: Arc::default(),
             });
-        Self { queries, last: None }
+        Self { queries, last: None, is_new: false }
     }
 
     /// Timestamp writes from stage `first` on; none while a read-back is pending.
@@ -170,6 +171,12 @@ impl StageTimes {
         self.queries.as_ref().is_some_and(|q| q.is_pending)
     }
 
+    /// [`Self::latest`], once for each timed frame.
+    pub fn new_times(&mut self) -> Option<[f32; STAGES.len()]> {
+        let times = self.latest();
+        times.filter(|_| std::mem::take(&mut self.is_new))
+    }
+
     /// Milliseconds of the latest timed frame's stages, 0 for absent ones; None before the first.
     pub fn latest(&mut self) -> Option<[f32; STAGES.len()]> {
         if let Some(q) = &mut self.queries
@@ -190,6 +197,7 @@ impl StageTimes {
                     before = tick(stage);
                 }
                 self.last = Some(times);
+                self.is_new = true;
             }
             q.readable.unmap();
             q.is_pending = false;

@@ -24,8 +24,8 @@ pub(super) struct SplatBins {
     pub offsets: wgpu::Buffer,
     segment_sums: wgpu::Buffer,
     histogram: wgpu::Buffer,
-    /// Workgroups of dispatches whose number only the device knows.
-    dispatches: wgpu::Buffer,
+    /// Dispatches and draws whose size only the device knows, as bin_scan.wgsl lays them out.
+    pub dispatches: wgpu::Buffer,
     /// Counts that only the device knows.
     pub status: wgpu::Buffer,
 }
@@ -96,7 +96,7 @@ impl SplatBins {
             offsets: gpu.bindable("offsets", words(splats) + 4)?,
             segment_sums: gpu.buffer("segment sums", words(gpu.segments()))?,
             histogram: gpu.zeroed("histogram", words(histogram_rows(gpu) << gpu.digit_bits()))?,
-            dispatches: gpu.buffer("dispatches", 24)?,
+            dispatches: gpu.buffer("dispatches", 56)?,
             status,
         })
     }
@@ -125,19 +125,15 @@ impl SplatBins {
             (&self.status).into(),
             self.order().into(),
             self.keys().into(),
+            (&self.segment_sums).into(),
         ];
         gpu.op(Kernel::DepthKeys, &bindings, gpu.groups(self.splats, 256))
     }
 
-    /// Sorts the splats by depth; leaves culled ones out or keeps them as the last.
-    pub fn depth_ops(&self, gpu: &Gpu, keeps_culled: bool) -> Vec<Op> {
+    /// Sorts the splats by depth and leaves culled ones out; counts the rest in [`Self::status`].
+    pub fn depth_ops(&self, gpu: &Gpu) -> Vec<Op> {
         let passes = u32::BITS / gpu.digit_bits();
-        let first = SortPass {
-            chunk: ALL_SPLATS,
-            is_first: 1,
-            keeps_culled: u32::from(keeps_culled),
-            ..SortPass::zeroed()
-        };
+        let first = SortPass { chunk: ALL_SPLATS, is_first: 1, ..SortPass::zeroed() };
         self.sort_ops(gpu, first, passes, &self.keys, &self.order)
     }
 
@@ -159,13 +155,6 @@ impl SplatBins {
 
     /// Counts the pairs of a chunk: [`Self::offsets`] and the chunk's entry in [`Self::status`].
     pub fn count_ops(&self, gpu: &Gpu, drawn: Projection<'_>, chunk: &TileChunk) -> Vec<Op> {
-        let scan = [
-            (&chunk.uniform).into(),
-            (&self.offsets).into(),
-            (&self.segment_sums).into(),
-            (&self.status).into(),
-            (&self.dispatches).into(),
-        ];
         vec![
             gpu.op(
                 Kernel::TileCounts,
@@ -176,11 +165,21 @@ impl SplatBins {
                     (&self.status).into(),
                     self.order().into(),
                     (&self.offsets).into(),
+                    (&self.segment_sums).into(),
                 ],
-                gpu.groups(self.splats, 256),
+                [gpu.segments(), 1],
             ),
-            gpu.op(Kernel::ScanSums, &scan, [gpu.segments(), 1]),
-            gpu.op(Kernel::ScanApply, &scan, [gpu.segments(), 1]),
+            gpu.op(
+                Kernel::ScanApply,
+                &[
+                    (&chunk.uniform).into(),
+                    (&self.offsets).into(),
+                    (&self.segment_sums).into(),
+                    (&self.status).into(),
+                    (&self.dispatches).into(),
+                ],
+                [gpu.segments(), 1],
+            ),
         ]
     }
 

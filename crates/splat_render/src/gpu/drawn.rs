@@ -165,7 +165,7 @@ impl Drawn {
             gpu.op(Kernel::DensityCodes, &bindings, gpu.groups(self.splats, 64))
         };
         let mut ops = vec![codes(0)];
-        ops.extend(bins.depth_ops(gpu, true));
+        ops.extend(bins.depth_ops(gpu));
         ops.push(codes(1));
         ops.extend(bins.resort_ops(gpu));
         ops

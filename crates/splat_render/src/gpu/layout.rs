@@ -167,7 +167,6 @@ pub(super) struct SortPass {
     pub shift: u32,
     pub chunk: u32,
     pub is_first: u32,
-    pub keeps_culled: u32,
     pub sum_set: u32,
 }
 

@@ -93,7 +93,7 @@ impl<'a> Choice<'a> {
     /// Marks the splats that grow.
     pub fn grow_ops(&self, gpu: &Gpu) -> Vec<Op> {
         let mut ops = vec![self.choose_op(gpu, Kernel::OriginalPull, &self.uniform)];
-        ops.extend(self.bins.depth_ops(gpu, false));
+        ops.extend(self.bins.depth_ops(gpu));
         ops.push(self.choose_op(gpu, Kernel::OriginalGrow, &self.uniform));
         ops
     }

@@ -58,7 +58,7 @@ impl Binned {
         let tiles = tile_count(projected.width, projected.height);
         let drawn = Projection { view: &view, splats2d: &splats2d };
         let all = TileChunk::new(gpu, Chunk::whole(tiles, splats, u32::MAX));
-        gpu.submit(&[&[bins.key_op(gpu, drawn, &all)], &bins.depth_ops(gpu, false)])?;
+        gpu.submit(&[&[bins.key_op(gpu, drawn, &all)], &bins.depth_ops(gpu)])?;
         let (runs, capacity) = bins.plan(gpu, drawn, tiles, slot_floats)?;
         let pairs = PairBins::new(gpu, capacity, tiles)?;
         let parts = Chunk::whole(tiles, splats, capacity).parts(&runs);

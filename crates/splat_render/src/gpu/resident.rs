@@ -3,7 +3,7 @@
 
 use super::bin::SplatBins;
 use super::device::{Gpu, Op};
-use super::layout::{Splat2d, View};
+use super::layout::{Splat2d, StatusHead, View};
 use super::project::{Projection, SplatBuffers, project_ops};
 use crate::camera::Camera;
 use crate::error::Result;
@@ -37,6 +37,7 @@ pub struct ResidentSplats {
     view: wgpu::Buffer,
     splats2d: wgpu::Buffer,
     pub(super) bins: SplatBins,
+    quads: wgpu::Buffer,
     project: Vec<Op>,
     sort: Vec<Op>,
 }
@@ -57,8 +58,8 @@ impl ResidentSplats {
         };
         Ok(Self {
             project: project_ops(gpu, drawn, &buffers, bins.keys()),
-            // Callers that draw in this order cannot know how many splats are culled.
-            sort: bins.depth_ops(gpu, true),
+            sort: bins.depth_ops(gpu),
+            quads: gpu.upload("quads", &[4u32, 0, 0, 0])?,
             sh_degree,
             sh_stride,
             raw: splats.raw,
@@ -118,6 +119,8 @@ impl ResidentSplats {
         gpu.queue.write_buffer(&self.view, 0, bytemuck::bytes_of(view));
         Gpu::record_pass(encoder, &self.project, project);
         Gpu::record_pass(encoder, &self.sort, sort);
+        let visible = std::mem::offset_of!(StatusHead, visible) as u64;
+        encoder.copy_buffer_to_buffer(&self.bins.status, visible, &self.quads, 4, 4);
     }
 
     /// `[N]` of `Splat2d`, as the last [`Self::record`] leaves them.
@@ -125,9 +128,14 @@ impl ResidentSplats {
         &self.splats2d
     }
 
-    /// `[N]` splats from front to back, culled ones last.
+    /// Splats from front to back, without culled ones.
     pub fn order(&self) -> &wgpu::Buffer {
         self.bins.order()
+    }
+
+    /// Arguments of an indirect draw of four vertices for each splat of [`Self::order`].
+    pub fn quads(&self) -> &wgpu::Buffer {
+        &self.quads
     }
 
     /// `[N * GEOMETRY]` mean, scales, quaternion wxyz, opacity, as they were given.

@@ -1,15 +1,24 @@
-//! Pictures on the device: resident splats, binned and rasterized for one camera after another. The host
-//! reads back only the number of (splat, tile) pairs.
+//! Pictures on the device: resident splats, binned and rasterized for one camera after another. No frame
+//! waits for the device: the number of (splat, tile) pairs comes back while later frames are drawn.
 
 use std::ops::Range;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::bin::{PairBins, TileChunk, pair_limit, tile_count};
-use super::device::Gpu;
+use super::device::{Gpu, Op};
 use super::layout::{Chunk, ChunkCount, StatusHead, View};
 use super::rasterize::{PictureBuffers, rasterize_ops};
 use super::resident::{ResidentSplats, ResidentView};
 use crate::constants::TILE;
 use crate::error::{Error, Result};
+
+/// Pairs per splat that there is room for at first, and the least number of pairs: 5 MB.
+const PAIRS_PER_SPLAT: u32 = 4;
+const LEAST_PAIRS: u32 = 1 << 18;
+
+/// Scenes and sizes whose commands are kept: two scenes side by side.
+const KEPT: usize = 2;
 
 /// A picture on the device, with the buffers of its stages.
 #[derive(Debug)]
@@ -20,7 +29,71 @@ pub struct ResidentPicture {
     pairs: PairBins,
     /// Pairs that `pairs` has room for.
     capacity: u32,
-    counted: wgpu::Buffer,
+    kept: Vec<Prepared>,
+}
+
+/// The commands for one scene and size.
+#[derive(Debug)]
+struct Prepared {
+    splats2d: wgpu::Buffer,
+    size: [u32; 2],
+    bin: Vec<Op>,
+    rasterize: Vec<Op>,
+    count: Count,
+}
+
+/// The number of pairs, on its way back.
+#[derive(Debug)]
+struct Count {
+    readable: wgpu::Buffer,
+    state: CountState,
+    is_mapped: Arc<AtomicBool>,
+}
+
+#[derive(Debug, PartialEq)]
+enum CountState {
+    Free,
+    Recorded,
+    Submitted,
+}
+
+impl Count {
+    const BYTES: u64 = size_of::<ChunkCount>() as u64;
+
+    fn new(gpu: &Gpu) -> Self {
+        let readable = gpu.readable(Self::BYTES);
+        Self { readable, state: CountState::Free, is_mapped: Arc::default() }
+    }
+
+    /// The number of an earlier frame, once, if it has arrived.
+    fn arrived(&mut self) -> Option<u32> {
+        if !self.is_mapped.swap(false, Ordering::Acquire) {
+            return None;
+        }
+        let view = self.readable.get_mapped_range(..).ok();
+        let count = view.map(|view| bytemuck::pod_read_unaligned::<ChunkCount>(&view));
+        self.readable.unmap();
+        self.state = CountState::Free;
+        count.map(|count| count.total)
+    }
+
+    fn record(&mut self, encoder: &mut wgpu::CommandEncoder, status: &wgpu::Buffer) {
+        if self.state == CountState::Free {
+            let head = size_of::<StatusHead>() as u64;
+            encoder.copy_buffer_to_buffer(status, head, &self.readable, 0, Self::BYTES);
+            self.state = CountState::Recorded;
+        }
+    }
+
+    fn submitted(&mut self) {
+        if self.state == CountState::Recorded {
+            let is_mapped = Arc::clone(&self.is_mapped);
+            self.readable.map_async(wgpu::MapMode::Read, .., move |result| {
+                is_mapped.store(result.is_ok(), Ordering::Release);
+            });
+            self.state = CountState::Submitted;
+        }
+    }
 }
 
 impl ResidentPicture {
@@ -33,7 +106,7 @@ impl ResidentPicture {
             buffers: PictureBuffers::new(gpu, pixels)?,
             pairs: PairBins::new(gpu, 0, tile_count(width, height))?,
             capacity: 0,
-            counted: gpu.readable(size_of::<ChunkCount>() as u64),
+            kept: Vec::new(),
         })
     }
 
@@ -42,9 +115,15 @@ impl ResidentPicture {
         &self.buffers.picture
     }
 
-    /// Draws the columns of a camera's picture: submits project, sort and a count of the pairs, waits for
-    /// the count, and records the rest to `encoder`. Each stage gets the timestamps of its last pass; if
-    /// the pairs exceed one binding, rasterize includes later parts' bin stages.
+    /// A buffer with the arguments of two indirect draws, and their offsets. If the pairs of the last
+    /// frame fit, the first draws a triangle and the second nothing. Else the picture is empty, the first
+    /// draws nothing and the second four vertices for each splat in order; a later frame makes room.
+    pub fn draws(splats: &ResidentSplats) -> (&wgpu::Buffer, [u64; 2]) {
+        (&splats.bins.dispatches, [40, 24])
+    }
+
+    /// Records the columns of a camera's picture; call [`Self::submitted`] once the encoder's commands
+    /// have been submitted. Each stage gets the timestamps of its last pass.
     pub fn record(
         &mut self,
         gpu: &Gpu,
@@ -52,7 +131,7 @@ impl ResidentPicture {
         splats: &ResidentSplats,
         view: &ResidentView<'_>,
         columns: Range<u32>,
-        [project, sort, mut bin, mut rasterize]: [Option<wgpu::ComputePassTimestampWrites<'_>>; 4],
+        [project, sort, bin, rasterize]: [Option<wgpu::ComputePassTimestampWrites<'_>>; 4],
     ) -> Result<()> {
         view.validate()?;
         let camera = view.camera;
@@ -76,43 +155,57 @@ impl ResidentPicture {
             tiles_x: width.div_ceil(TILE),
             ..all
         };
-        let tiles = tile_count(width, camera.height);
-        let (drawn, bins) = (splats.projection(), &splats.bins);
-        let whole = Chunk::whole(tiles, splats.len(), u32::MAX);
-        let count = bins.count_ops(gpu, drawn, &TileChunk::new(gpu, whole));
-        let mut first = gpu.device.create_command_encoder(&Default::default());
-        splats.record_view(gpu, &mut first, &part, [project, sort]);
-        Gpu::record_pass(&mut first, &count, None);
-        let bytes = size_of::<ChunkCount>() as u64;
-        let head = size_of::<StatusHead>() as u64;
-        first.copy_buffer_to_buffer(&bins.status, head, &self.counted, 0, bytes);
-        gpu.queue.submit([first.finish()]);
-        let data = gpu.read(&[(&self.counted, bytes)])?;
-        let ChunkCount { total, .. } = bytemuck::pod_read_unaligned(&data[0]);
+        self.make_room(gpu, splats.len())?;
+        let prepared = self.prepared(gpu, splats, [width, camera.height]);
+        splats.record_view(gpu, encoder, &part, [project, sort]);
+        Gpu::record_pass(encoder, &prepared.bin, bin);
+        Gpu::record_pass(encoder, &prepared.rasterize, rasterize);
+        prepared.count.record(encoder, &splats.bins.status);
+        gpu.check()
+    }
 
-        let is_whole = total <= pair_limit(gpu, 1);
-        let (runs, most) = if is_whole {
-            (std::iter::once(0..tiles).collect(), total)
-        } else {
-            bins.plan(gpu, drawn, tiles, 1)?
-        };
-        if most > self.capacity {
-            // Some more than this frame needs, so that not every frame of an approach makes room.
-            let room = (most.saturating_add(most / 4)).min(pair_limit(gpu, 1));
+    /// Starts to bring back the number of pairs of the frame just submitted.
+    pub fn submitted(&mut self) {
+        self.kept.iter_mut().for_each(|prepared| prepared.count.submitted());
+    }
+
+    /// Makes room for the pairs of earlier frames, and some more, so that not every frame of an approach
+    /// makes room.
+    fn make_room(&mut self, gpu: &Gpu, splats: u32) -> Result<()> {
+        let counted = self.kept.iter_mut().filter_map(|prepared| prepared.count.arrived()).max();
+        let needed = counted.map_or(0, |pairs| pairs.saturating_add(pairs / 4));
+        let limit = pair_limit(gpu, 1);
+        let first = splats.saturating_mul(PAIRS_PER_SPLAT).max(LEAST_PAIRS);
+        let room = needed.max(first).min(limit);
+        let is_short = counted.is_some_and(|pairs| pairs > self.capacity);
+        if self.capacity == 0 || (is_short && room > self.capacity) {
+            self.kept.clear();
             self.pairs = PairBins::new(gpu, room, tile_count(self.width, self.height))?;
             self.capacity = room;
         }
-        let whole = Chunk { capacity: self.capacity, ..whole };
-        for chunk in whole.parts(&runs) {
-            let chunk = TileChunk::new(gpu, chunk);
-            // The whole picture's pairs are counted already.
-            let mut ops = if is_whole { Vec::new() } else { bins.count_ops(gpu, drawn, &chunk) };
-            ops.extend(bins.pair_ops(gpu, drawn, &chunk, &self.pairs));
-            Gpu::record_pass(encoder, &ops, bin.take());
-            let ops = rasterize_ops(gpu, drawn, &chunk, &self.pairs, &self.buffers);
-            let stamps = if chunk.chunk.is_last == 1 { rasterize.take() } else { None };
-            Gpu::record_pass(encoder, &ops, stamps);
-        }
-        gpu.check()
+        Ok(())
+    }
+
+    fn prepared(&mut self, gpu: &Gpu, splats: &ResidentSplats, size: [u32; 2]) -> &mut Prepared {
+        let drawn = splats.projection();
+        let is_same = |kept: &Prepared| kept.size == size && kept.splats2d == *drawn.splats2d;
+        let at = self.kept.iter().position(is_same).unwrap_or_else(|| {
+            if self.kept.len() == KEPT {
+                self.kept.remove(0);
+            }
+            let tiles = tile_count(size[0], size[1]);
+            let chunk = TileChunk::new(gpu, Chunk::whole(tiles, splats.len(), self.capacity));
+            let mut bin = splats.bins.count_ops(gpu, drawn, &chunk);
+            bin.extend(splats.bins.pair_ops(gpu, drawn, &chunk, &self.pairs));
+            self.kept.push(Prepared {
+                splats2d: drawn.splats2d.clone(),
+                size,
+                bin,
+                rasterize: rasterize_ops(gpu, drawn, &chunk, &self.pairs, &self.buffers),
+                count: Count::new(gpu),
+            });
+            self.kept.len() - 1
+        });
+        &mut self.kept[at]
     }
 }

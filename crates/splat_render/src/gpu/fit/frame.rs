@@ -129,7 +129,7 @@ impl Frame {
             v_splats2d: scene.v_splats2d.clone(),
         };
         let mut ops = scene.adam.project_ops(gpu, drawn, bins, color_steps);
-        ops.extend(bins.depth_ops(gpu, false));
+        ops.extend(bins.depth_ops(gpu));
         for chunk in &chunks {
             bin(&mut ops, chunk);
             ops.extend(rasterize_ops(gpu, drawn, chunk, pairs, &self.picture));

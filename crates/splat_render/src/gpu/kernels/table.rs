@@ -40,7 +40,6 @@ kernels! {
     FitGeometry: FIT_GEOMETRY, "fit_geometry";
     DepthKeys: BIN_COUNT, "depth_keys";
     TileCounts: BIN_COUNT, "tile_counts";
-    ScanSums: BIN_SCAN, "scan_sums";
     ScanApply: BIN_SCAN, "scan_apply";
     Emit: BIN_EMIT, "emit";
     SortHistogram: BIN_SORT, "sort_histogram";
@@ -105,6 +104,7 @@ const SORT_KEYS: &str = include_str!("../shaders/bin_sort_keys.wgsl");
 const SORT_BINDINGS: [Access; 7] =
     [Uniform, ReadWrite, Read, Read, ReadWrite, ReadWrite, ReadWrite];
 const BIN_TILES: &str = include_str!("../shaders/bin_tiles.wgsl");
+const BIN_SEGMENTS: &str = include_str!("../shaders/bin_segments.wgsl");
 const TILE_LIST: &str = include_str!("../shaders/tile_list.wgsl");
 const TILE_BLOCKS: &str = include_str!("../shaders/tile_blocks.wgsl");
 const BACKWARD: &str = include_str!("../shaders/rasterize_backward.wgsl");
@@ -248,14 +248,15 @@ static ORIGINAL_RESET: Source = Source::new(
 
 static BIN_COUNT: Source = Source::new(
     "bin_count",
-    &[BIN_TILES, include_str!("../shaders/bin_count.wgsl")],
-    &[Uniform, Uniform, Read, Read, Read, ReadWrite],
-);
+    &[BIN_TILES, BIN_SEGMENTS, include_str!("../shaders/bin_count.wgsl")],
+    &[Uniform, Uniform, Read, Read, Read, ReadWrite, ReadWrite],
+)
+.segmented();
 
 static BIN_SCAN: Source = Source::new(
     "bin_scan",
-    &[include_str!("../shaders/bin_scan.wgsl")],
-    &[Uniform, ReadWrite, ReadWrite, ReadWrite, ReadWrite],
+    &[BIN_SEGMENTS, include_str!("../shaders/bin_scan.wgsl")],
+    &[Uniform, ReadWrite, Read, ReadWrite, ReadWrite],
 )
 .segmented();
 

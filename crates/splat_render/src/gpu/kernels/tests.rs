@@ -128,8 +128,8 @@ fn rust_and_wgsl_agree_on_layouts() {
         Project, Splat2d as "Splat2d": mean pq color r depth opacity radii;
         DepthKeys, Chunk as "Chunk":
             tile_begin tile_end capacity splats index is_first is_last list_begin list_end groups_max;
-        ScanSums, ChunkCount as "ChunkCount": pairs total;
-        SortCount, SortPass as "SortPass": shift chunk is_first keeps_culled sum_set;
+        ScanApply, ChunkCount as "ChunkCount": pairs total;
+        SortCount, SortPass as "SortPass": shift chunk is_first sum_set;
         DepthLoss, DepthStep as "DepthStep": scale;
         Exposure, ExposureUniform as "Exposure": gain offset behind background;
         AdamColors, Step as "Step":
@@ -146,7 +146,7 @@ fn rust_and_wgsl_agree_on_layouts() {
         DensityBounds, CellsUniform as "Cells": low splats scale upper;
     }
     assert_layout(
-        Kernel::ScanSums,
+        Kernel::ScanApply,
         "Status",
         // A trailing runtime array counts as one element.
         size_of::<StatusHead>() + size_of::<ChunkCount>(),

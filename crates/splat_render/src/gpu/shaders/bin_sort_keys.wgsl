@@ -1,5 +1,5 @@
-// Input of the sort: the splats by depth (culled ones are dropped in the first pass or kept), or the
-// pairs of a chunk. Follows shared.wgsl.
+// Input of the sort: the splats by depth, whose first pass leaves culled ones out, or the pairs of a
+// chunk. Follows shared.wgsl.
 
 struct SortPass {
     // Lowest bit of the digit.
@@ -8,8 +8,6 @@ struct SortPass {
     chunk: u32,
     // 1 in the first pass over the splats, whose values are their indices.
     is_first: u32,
-    // 1 if culled splats stay, at the end.
-    keeps_culled: u32,
     // The set of sums of bin_sort_wide.wgsl.
     sum_set: u32,
 }
@@ -36,7 +34,7 @@ fn same_for_all(local: u32) -> u32 {
 }
 
 fn is_sorted(key: u32) -> bool {
-    return pass_.is_first == 0u || pass_.keeps_culled == 1u || key != CULLED_KEY;
+    return pass_.is_first == 0u || key != CULLED_KEY;
 }
 
 fn value_of(i: u32, value: u32) -> u32 {
