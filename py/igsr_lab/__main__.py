@@ -20,6 +20,10 @@ COMMANDS = {
         *("gpu_check", "gpu_check_command"),
         "Test and measure this computer's GPU, and write a report.",
     ),
+    "gpu-session": (
+        *("gpu_session", "gpu_session_command"),
+        "Measure all of a GPU within eight minutes, and write a report.",
+    ),
     "synth": ("synth", "synth_command", "Make synthetic captures with exact cameras."),
     "pairs": ("denoiser", "pairs_command", "Make training pairs for the denoiser."),
     "train": ("denoiser", "train_command", "Train a denoiser on training pairs."),

@@ -16,11 +16,13 @@ from igsr_lab.bench.growth import GROWN_COUNT, GROWN_SIDE, evenly_chosen, shot_o
 from igsr_lab.bench.gsplat_rows import NAME, gsplat_rows, why_not
 from igsr_lab.bench.kernel_times import SIZES as SIZES_OF_STEPS
 from igsr_lab.bench.kernel_times import SOFTWARE, kernel_tables
+from igsr_lab.bench.plots import kernels_plot
 from igsr_lab.bench.run import Settings, not_run, rows_or_reason, run_benchmark
 from igsr_lab.bench.scenes import garden, upstream
 from igsr_lab.bench.stage_rows import pipeline_rows
 from igsr_lab.bench.table import milliseconds, not_run_lines
 from igsr_lab.bench.viewer_rows import SIZES, VIEWER, viewer_rows
+from igsr_lab.report_parts import cell
 
 #: Splats and side of the ball for software adapters.
 SMALL_BALL = (10_000, 256)
@@ -36,7 +38,8 @@ def describe_device() -> dict[str, Any]:
     except RuntimeError as error:
         return {"name": None, "error": str(error)}
     start = {"open_ms": opened, "compile_ms": compiled, "self_test_ms": tested}
-    return {**device, "start": start, "error": None}
+    kernels = _core.backend_info("gpu")["instruction_set"]
+    return {**device, "kernels": kernels, "start": start, "error": None}
 
 
 def device_report(
@@ -104,19 +107,40 @@ def json_beside(path: Path) -> Path:
 
 
 def write_device_report(path: Path, report: dict[str, Any]) -> None:
-    """Write the page and the JSON file; the report may have "tests" of the kernels."""
+    """Write the page and the JSON file.
+
+    The report may have "tests" of the kernels, and a session's "parts" and tables of kernels with
+    checks, "checked".
+    """
     write_json(json_beside(path), report)
     variables = {
         "machine": report["machine"],
         "device": report["device"],
         "tests": report.get("tests"),
-        "kernels": report.get("kernels", []),
+        "parts": report.get("parts"),
+        "kernels": _with_checks(report.get("kernels", []), report.get("checked", [])),
         "rows": [_cells(row) for row in report["rows"] if row["ms"] is not None],
         "not_run": not_run_lines(report["rows"]),
         "json": json_beside(path).name,
+        "cell": cell,
     }
     templates = Path(__file__).with_name("templates")
     write_template(path, templates, "gpu.html.jinja", variables)
+
+
+def _with_checks(
+    tables: list[dict[str, Any]], checked: list[dict[str, Any]]
+) -> list[dict[str, Any]]:
+    """Tables of kernels with plots, and with the table and medians of the same ball with checks."""
+    checked_of = {(table["splats"], table["side"]): table for table in checked}
+    result = []
+    for table in tables:
+        other = checked_of.get((table["splats"], table["side"]))
+        medians = {row["name"]: row["median"] for row in other["kernels"]} if other else {}
+        kernels = [{**row, "checked": medians.get(row["name"])} for row in table["kernels"]]
+        plot = kernels_plot(kernels)
+        result.append({**table, "checked": other, "kernels": kernels, "plot": plot})
+    return result
 
 
 def _cells(row: dict[str, Any]) -> dict[str, Any]:

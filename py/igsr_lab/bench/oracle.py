@@ -154,8 +154,13 @@ class PairCounts:
     blended: int  # pairs of ``pixels`` that come before their pixel is opaque
 
 
-def pair_counts(projected: Arrays, width: int, height: int) -> PairCounts:
-    """Count pairs in f64 by numpy."""
+def pair_counts(
+    projected: Arrays,
+    width: int,
+    height: int,
+    chosen: Callable[[list[Crop]], list[Crop]] = list,
+) -> PairCounts:
+    """Count pairs in f64 by numpy; ``chosen`` chooses the crops to count in."""
     order = np.argsort(projected["depths"].astype(np.float32), kind="stable")
     rank = np.empty(len(order), dtype=np.intp)
     rank[order] = np.arange(len(order))
@@ -176,7 +181,7 @@ def pair_counts(projected: Arrays, width: int, height: int) -> PairCounts:
         blended = seen & (through >= _core.TRANSMITTANCE_MIN)
         return int(seen.any(axis=(1, 2)).sum()), int(seen.sum()), int(blended.sum())
 
-    counts = _on_all_cores(work, crops(projected, width, height))
+    counts = _on_all_cores(work, chosen(crops(projected, width, height)))
     return PairCounts(*(sum(column) for column in zip(*counts, strict=True)))
 
 

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import base64
+import io
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from igsr_lab.bench.growth import GROWN_COUNT, GROWN_SIDE
 from igsr_lab.bench.table import machine_line
@@ -14,6 +18,26 @@ COLORS = {"cpu": "#0072b2", "gpu": "#d55e00", "reference": "#444444"}
 MARKERS = "os^Dv*XP<>"
 #: Errors of zero are drawn at this error on logarithmic axes.
 MIN_ERROR = 1e-16
+
+
+def kernels_plot(rows: list[dict[str, Any]]) -> str:
+    """Draw the times of kernels, also with checks if they are known; PNG in base64."""
+    figure = new_figure(8.0, 4.4)
+    axis = figure.subplots()
+    at = np.arange(len(rows))
+    axis.barh(at - 0.2, [row["median"] for row in rows], 0.4, label="median")
+    axis.plot([row["least"] for row in rows], at - 0.2, "k|", label="least")
+    if any(row["checked"] for row in rows):
+        checked = [row["checked"] or 0.0 for row in rows]
+        axis.barh(at + 0.2, checked, 0.4, label="median with checks")
+    axis.set_yticks(at, [row["name"] for row in rows], fontsize=8)
+    axis.invert_yaxis()
+    axis.set_xlabel("ms in a step")
+    axis.grid(alpha=0.3, axis="x")
+    axis.legend(loc="lower right", fontsize=8)
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=110)
+    return base64.b64encode(file.getvalue()).decode("ascii")
 
 
 def plot_speed_vs_error(path: Path, report: dict[str, Any]) -> None:

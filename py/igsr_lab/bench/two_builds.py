@@ -27,6 +27,7 @@ from igsr.errors import IgsrError
 from igsr_lab.bench.comparison import size_row
 from igsr_lab.bench.fit_rows import fit_step_ms
 from igsr_lab.bench.growth import evenly_chosen, shot_of
+from igsr_lab.bench.kernel_times import SIZES
 from igsr_lab.bench.scenes import Arrays, splats2d, upstream
 from igsr_lab.bench.stage_rows import compare, repeated, w1_comparison
 from igsr_lab.bench.table import describe_machine
@@ -35,8 +36,6 @@ from igsr_lab.bench.table import describe_machine
 ROUNDS = 7
 #: Splats and side of W1's picture.
 STAGES = (20_000, 400)
-#: Splats and sides of the fit steps.
-STEPS = ((20_000, 400), (100_000, 512), (1_000_000, 512), (100_000, 2048))
 PAIR_PROTOCOL = (
     "Two processes, each with one build, take turns; the order alternates. ratio is old : new, "
     "each the minimum over its repeats of that round: the median over the rounds, with the "
@@ -70,7 +69,7 @@ class TimedWork:
 def all_work(workloads: list[str], backend: str, seed: int) -> list[TimedWork]:
     """The workloads ("W1", "W4" or both) of one backend."""
     sizes = [("W1", *STAGES)] * ("W1" in workloads)
-    sizes += [("W4", *size) for size in STEPS if "W4" in workloads]
+    sizes += [("W4", *size) for size in SIZES if "W4" in workloads]
     make = {"W1": _stages, "W4": _step}
     return [
         make[workload](f"{workload} {count} {side}", backend, seed, count, side)

@@ -29,7 +29,9 @@ SMALL_FRAMES = 3
 TIMEOUT_SECONDS = 600.0
 
 
-def viewer_rows(size: tuple[int, int], seed: int, small: bool) -> list[dict[str, Any]]:
+def viewer_rows(
+    size: tuple[int, int], seed: int, small: bool, draw: str = "auto"
+) -> list[dict[str, Any]]:
     """Minimum and median time of a frame of a ball of splats, and the median of each stage.
 
     A frame is compared with the rasterizer's picture, not with the reference: ``off_of_255``.
@@ -40,7 +42,7 @@ def viewer_rows(size: tuple[int, int], seed: int, small: bool) -> list[dict[str,
         file = Path(folder) / "ball.ply"
         Splats(**{"sh" if name == "colors" else name: a for name, a in splats.items()}).save(file)
         frames = SMALL_FRAMES if small else FRAMES
-        words = [str(file), "--time", str(frames), "--size", f"{width}x{height}"]
+        words = [str(file), "--time", str(frames), "--size", f"{width}x{height}", "--draw", draw]
         text = _output(words)
     stages = {name: float(ms) for name, ms in re.findall(r"^ +([a-z]+) +([0-9.]+)$", text, re.M)}
     off = re.search(r"off the rasterizer's picture by ([0-9]+) of 255", text)
@@ -49,7 +51,7 @@ def viewer_rows(size: tuple[int, int], seed: int, small: bool) -> list[dict[str,
     return [
         {
             **size_row(VIEWER, "gpu", count, width, height),
-            "pass": "frame",
+            "pass": "frame" if draw == "auto" else f"frame by {draw}",
             "ms": stages.pop("least"),
             "ms_median": stages.pop("whole"),
             "stages_ms": stages,
