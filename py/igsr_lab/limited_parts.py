@@ -14,6 +14,8 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
+from igsr.errors import IgsrError
+
 #: Time limit for a killed part to end: a driver may hold it.
 END_TIMEOUT_SECONDS = 5.0
 
@@ -78,4 +80,6 @@ def _work(work: Callable[[], Iterable[Entries]], variables: dict[str, str], file
             for entries in work():
                 print(json.dumps(entries, allow_nan=False), file=lines, flush=True)
         except Exception as error:  # of any kind; the next part runs
-            print(json.dumps({"error": f"{type(error).__name__}: {error}"}), file=lines)
+            is_sentence = isinstance(error, IgsrError | RuntimeError)
+            text = str(error) if is_sentence else f"{type(error).__name__}: {error}"
+            print(json.dumps({"error": text}), file=lines)

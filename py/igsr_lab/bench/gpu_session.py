@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from igsr.errors import IgsrError
 from igsr_lab.bench.fit_rows import STEPS_PER_STATE
 from igsr_lab.bench.gpu_report import describe_device, gsplat_steps, write_device_report
 from igsr_lab.bench.growth import measure
@@ -28,7 +29,10 @@ PROTOCOL = (
 
 
 def _device() -> Iterator[Entries]:
-    yield {"device": describe_device()}
+    device = describe_device()
+    yield {"device": device}
+    if device["error"]:
+        raise IgsrError(device["error"])
 
 
 def _kernels(entry: str, sizes: Iterable[tuple[int, int]], seed: int) -> Iterator[Entries]:
@@ -84,7 +88,7 @@ def run_session(path: Path, on_part: Callable[[str], object], seed: int = 0) -> 
     """Run all parts, and write the page ``path`` and its JSON file after each.
 
     Returns the report. Its "parts" have "name", "limit_s", "seconds" and "error", which is None
-    for a part that ended well.
+    for a part that ended well with all of its rows.
     """
     report: dict[str, Any] = {
         "device": {"name": None, "error": "The device did not answer."},
@@ -99,6 +103,10 @@ def run_session(path: Path, on_part: Callable[[str], object], seed: int = 0) -> 
         found, error = run_part(part)
         for name, entry in (item for entries in found for item in entries.items()):
             report[name] = entry if name == "device" else report[name] + entry
+            if name == "rows":
+                # A session without gsplat is complete.
+                failed = (row["not_run"] for row in entry if "not_run" in row)
+                error = error or (None if part.name == NAME else next(failed, None))
         seconds = time.perf_counter() - began
         line = {"name": part.name, "limit_s": part.limit_s, "seconds": seconds, "error": error}
         report["parts"].append(line)

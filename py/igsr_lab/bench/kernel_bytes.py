@@ -28,7 +28,7 @@ def kernel_bytes(
 
     Args:
         splats: number of splats.
-        visible: number of those that are not culled.
+        visible: number that is not culled.
         pairs: number of (splat, tile) pairs, of more than 256 tiles.
         pixels: number of pixels.
         coefficients: SH coefficients of a color.
