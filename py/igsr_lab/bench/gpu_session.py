@@ -76,8 +76,8 @@ def plan(small: bool, seed: int) -> list[Part]:
     sizes = SMALL_SIZES if small else SIZES
     timed, checked = (partial(_kernels, name, sizes, seed) for name in ("kernels", "checked"))
     return [
-        Part("kernels", 90.0, timed, {"IGSR_GPU_CHECKS": "0"}),
-        Part("kernels with checks", 90.0, checked, {"IGSR_GPU_CHECKS": "1"}),
+        Part("kernels", 85.0, timed, {"IGSR_GPU_CHECKS": "0"}),
+        Part("kernels with checks", 85.0, checked, {"IGSR_GPU_CHECKS": "1"}),
         Part(VIEWER, 80.0, partial(_viewer, FRAMES[-1], small, seed)),
         Part("steps with errors", 110.0, partial(_steps, sizes, seed)),
         Part(NAME, 60.0, partial(_gsplat, sizes, seed)),
