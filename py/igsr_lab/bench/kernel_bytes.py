@@ -41,7 +41,6 @@ def kernel_bytes(
         "sort_count": 4 * n + 12 * v + 8 * p,
         "sort_place": 4 * n + 56 * v + 32 * p,
         "tile_counts": 56 * v,
-        "scan_sums": 4 * v,
         "scan_apply": 12 * v,
         "emit": 56 * v + 12 * p,
         "ranges": 16 * p,
