@@ -18,7 +18,7 @@ CARGO ?= cargo
 VENV := .venv
 BIN := $(VENV)/bin
 
-# What Python loads is a release build. Rust tests have the profile of plain `cargo test`: optimised,
+# What Python loads is a release build. Rust tests have the profile of plain `cargo test`: optimized,
 # with assertions and overflow checks.
 PROFILE := --release
 # The interpreter that maturin builds against: with another one, pyo3 would be compiled twice.
@@ -154,6 +154,7 @@ check-python: build $(VENV)/.dev-ready
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python tests/plain_words.py --check
+	$(BIN)/codespell *.md Makefile pyproject.toml crates docs examples py tests
 	$(PYTEST)
 
 # ---- system packages ---------------------------------------------------------------------------

@@ -218,14 +218,14 @@ def die_texture() -> np.ndarray:
 # ---- the scene --------------------------------------------------------------------------------
 
 
-def matte(colour: Any) -> Scene:
-    if isinstance(colour, np.ndarray):
-        return {"type": "diffuse", "reflectance": bitmap(colour)}
-    return {"type": "diffuse", "reflectance": {"type": "rgb", "value": colour}}
+def matte(color: Any) -> Scene:
+    if isinstance(color, np.ndarray):
+        return {"type": "diffuse", "reflectance": bitmap(color)}
+    return {"type": "diffuse", "reflectance": {"type": "rgb", "value": color}}
 
 
-def glossy(colour: Any, roughness: float) -> Scene:
-    reflectance = matte(colour)["reflectance"]
+def glossy(color: Any, roughness: float) -> Scene:
+    reflectance = matte(color)["reflectance"]
     return {
         "type": "roughplastic",
         "distribution": "ggx",

@@ -30,7 +30,7 @@ def charbonnier(picture: torch.Tensor, photo: torch.Tensor) -> torch.Tensor:
 
 
 def over(photo: np.ndarray, background: torch.Tensor) -> torch.Tensor:
-    """A photo, uint8 [H, W, 3 or 4], over a background colour; float32 [H, W, 3]."""
+    """A photo, uint8 [H, W, 3 or 4], over a background color; float32 [H, W, 3]."""
     pixels = torch.from_numpy(photo).float() / 255.0
     if pixels.shape[2] == 3:
         return pixels

@@ -59,8 +59,8 @@ def test_missing_unknown_and_doubled_arguments_are_type_errors(good, function):
         rest = {key: value for key, value in arguments.items() if key != name}
         with pytest.raises(TypeError, match=rf"{function}\(\) missing .*'{name}'"):
             call(**rest)
-    with pytest.raises(TypeError, match=rf"{function}\(\) got an unexpected .*'colour'"):
-        call(**arguments, colour=1)
+    with pytest.raises(TypeError, match=rf"{function}\(\) got an unexpected .*'flavor'"):
+        call(**arguments, flavor=1)
     first = next(iter(arguments))
     with pytest.raises(TypeError, match=f"multiple values for argument '{first}'"):
         call(arguments[first], **arguments)

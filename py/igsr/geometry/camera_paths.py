@@ -70,7 +70,7 @@ def orbit(splats: Splats, cameras: Sequence[Camera], frames: int) -> list[Camera
 def cameras_around(splats: Splats, count: int, side: int) -> list[Camera]:
     """``count`` cameras spread evenly on a sphere, looking at the middle of the splats.
 
-    Neighbours in the list stand far from each other, so every so many of them are spread as well.
+    Neighbors in the list stand far from each other, so every so many of them are spread as well.
     Pictures are ``side`` pixels wide and high.
 
     Args:

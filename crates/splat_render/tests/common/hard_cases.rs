@@ -121,7 +121,7 @@ pub fn a_zero_quaternion_culls_its_splat(stages: &dyn Stages<f32>) {
 
 /// Splats just on either side of each threshold are handled alike everywhere.
 pub fn thresholds_are_the_same_everywhere(stages: &dyn Stages<f32>) {
-    // One pixel, splats centerd on it: alpha is the opacity itself.
+    // One pixel, splats centered on it: alpha is the opacity itself.
     let render = |opacities: &[f32]| {
         let mut projected = Projected::<f32>::culled(opacities.len(), 1, 1);
         for (i, &opacity) in opacities.iter().enumerate() {
