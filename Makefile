@@ -1,5 +1,6 @@
 # make setup  installs what the tests need with apt: a software Vulkan driver, a browser, shader tools, libGL
 # make test   runs the checks: about eight minutes on two cores once built
+# make lint   runs the checks of make test that take seconds
 # make test-long   runs the tests that take longer
 # make demo   makes a scene of the example photos in out/demo
 # make build  builds igsr into .venv
@@ -29,7 +30,7 @@ RUST_SOURCES := $(shell find crates -type f \( -name '*.rs' -o -name '*.wgsl' -o
 	Cargo.toml Cargo.lock
 
 .PHONY: demo setup test test-long fuzz bench bench-check gpu-check accuracy docs profile build wheel \
-	check-rust check-python check-system example-capture clean
+	lint check-rust check-python check-system example-capture clean
 .DELETE_ON_ERROR:
 
 # ---- what a user runs --------------------------------------------------------------------------
@@ -148,14 +149,16 @@ fuzz:
 	IGSR_FUZZ_CASES=$(CASES) $(CARGO) test --locked --package splat_render \
 		--test formats mutations -- --nocapture
 
-check-python: build $(VENV)/.dev-ready
+check-python: lint
+	$(PYTEST)
+
+lint: build $(VENV)/.dev-ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python tests/plain_words.py --check
 	$(BIN)/codespell *.md Makefile pyproject.toml crates docs examples py tests
-	$(PYTEST)
 
 # ---- system packages ---------------------------------------------------------------------------
 

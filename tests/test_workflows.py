@@ -12,11 +12,27 @@ ROOT = Path(__file__).parents[1]
 WORKFLOW = ROOT / ".github" / "workflows" / "wheels.yml"
 
 
-def checked(path):
-    """The result of check-jsonschema for a workflow; its schema comes with the package."""
+def checked(path, schema="workflows"):
+    """The result of check-jsonschema for a file; the schemas come with the package."""
     program = Path(sys.executable).with_name("check-jsonschema")
-    command = [str(program), "--builtin-schema", "vendor.github-workflows", str(path)]
+    command = [str(program), "--builtin-schema", f"vendor.github-{schema}", str(path)]
     return subprocess.run(command, capture_output=True, text=True, timeout=60)
+
+
+@pytest.mark.parametrize(
+    ("folder", "schema"), [("workflows", "workflows"), ("ISSUE_TEMPLATE", "issue-forms")]
+)
+def test_files_for_the_forge_keep_to_their_schemas(folder, schema):
+    files = sorted((ROOT / ".github" / folder).glob("*.yml"))
+    assert len(files) == 2
+    for path in files:
+        result = checked(path, schema)
+        assert result.returncode == 0, result.stdout
+
+
+def test_the_workflow_of_tests_has_the_compiler_that_the_workspace_needs():
+    rust = re.search(r'rust-version = "(\S+)"', (ROOT / "Cargo.toml").read_text())[1]
+    assert f"image: rust:{rust}-" in WORKFLOW.with_name("tests.yml").read_text()
 
 
 def test_the_workflow_keeps_to_the_schema_of_workflows(tmp_path):
