@@ -9,7 +9,7 @@ use base64::engine::general_purpose::STANDARD;
 use serde_json::Value;
 
 use super::{CHUNK_BINARY, CHUNK_JSON, EXTENSION, MAGIC, TEXT_MAX};
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::io::bytes::{Bytes, Named, u32_at};
 use crate::io::{Format, limits, open_file};
 
@@ -137,8 +137,9 @@ impl<'a> Document<'a> {
         let name = percent_decoded(uri);
         let plain = Path::new(&name).components().all(|part| matches!(part, Component::Normal(_)));
         if name.contains([':', '\\', '\0']) || name.is_empty() || !plain {
+            let shown = beginning(uri);
             return Err(self.bad(format!(
-                "refers to {uri:?}; only files in its own folder are opened: write a .glb instead"
+                "refers to {shown:?}; only files in its own folder are opened: write a .glb instead"
             )));
         }
         let path = self.named.0.with_file_name(name);
@@ -147,11 +148,17 @@ impl<'a> Document<'a> {
 
     fn read(&self, path: &Path, uri: &str) -> Result<Vec<u8>> {
         use std::io::Read;
+        let refers = |to: &str| {
+            self.bad(format!("refers to {:?}, which {to}", beginning(uri)))
+        };
+        let file = open_file(path).map_err(|error| match error {
+            Error::File { reason, .. } => refers(&reason),
+            error => error,
+        })?;
         let mut bytes = Vec::new();
-        open_file(path)?
-            .take(limits::FILE_MAX.saturating_sub(self.size() as u64))
+        file.take(limits::FILE_MAX.saturating_sub(self.size() as u64))
             .read_to_end(&mut bytes)
-            .map_err(|e| self.bad(format!("refers to {uri:?}, which cannot be read ({e})")))?;
+            .map_err(|e| refers(&format!("cannot be read ({e})")))?;
         Ok(bytes)
     }
 }
@@ -174,6 +181,11 @@ fn split_glb<'a>(bytes: &'a [u8], named: &Named<'a>) -> Result<(&'a [u8], Option
         }
     }
     Ok((json.ok_or_else(|| named.bad("has no JSON in it; it is truncated"))?, binary))
+}
+
+/// The beginning of a URI, which may be a damaged data: URI of many MB.
+fn beginning(uri: &str) -> String {
+    uri.chars().take(80).collect()
 }
 
 /// The count or index `key` of an object.
