@@ -178,19 +178,17 @@ def accuracy_page(report: dict[str, Any]) -> str:
         "",
         f"Measured with {machine_line(report['machine'])}. The scene: {first['splats']} splats of "
         f"about a pixel on {first['width']}×{first['height']}; {compared} of its "
-        f"{first['width'] * first['height']} pixels are compared, and a line of the table leaves "
-        f"out at most {left_out} of them. Gradients are of a random loss over color, alpha and "
-        "depth.",
+        f"{first['width'] * first['height']} pixels are compared; no row leaves out more than "
+        f"{left_out}. Gradients are of a random loss over color, alpha and depth.",
         "",
         "## Arithmetic",
         "",
-        "Each implementation against the f64 reference at the same setting, on the same f32 "
-        "splats. The reference's line compares the reference over all splats with the culled one "
-        "that is used here: culling only leaves out pairs that contribute nothing. Gradient errors "
-        "are relative to the largest of their kind, for the worst kind. A pixel of the "
+        "Each implementation is compared with the f64 reference at the same setting, on the same "
+        "f32 splats. The rows `reference` compare the reference without and with culling, which "
+        "leaves out only pairs that contribute nothing. Gradient errors are divided by the largest "
+        "gradient of the same parameter; the table has the worst parameter. A pixel of the "
         "[band](numerics.md#bounds-and-what-is-measured) is left out only if it differs by more "
-        f"than the bound, {max(BOUND_3D.values()):g}, or its transmittance by more than "
-        f"{MIN_FLIP:g} of itself.",
+        f"than {max(BOUND_3D.values()):g}, or its transmittance by more than {MIN_FLIP:.1%}.",
         "",
         *markdown_table(heads, figures, left=2),
         "",
@@ -198,10 +196,10 @@ def accuracy_page(report: dict[str, Any]) -> str:
         "",
         "## Settings",
         "",
-        "The error of each setting in f64: lower SH degrees against the highest, the plain and the "
-        "antialiased mode against a picture with many samples per pixel instead of the blur. "
-        "These splats use all degrees and are small; fitted scenes have weaker higher degrees and "
-        "smaller errors.",
+        "The table has the error of each setting in f64. Lower SH degrees are compared with the "
+        "highest; the plain and the antialiased mode with a picture of many samples per pixel, "
+        "without blur. These splats use all degrees and are small; fitted scenes have weaker "
+        "higher degrees and smaller errors.",
         "",
         *markdown_table(["setting", "against", "max", "mean"], of_settings.values(), left=2),
         "",

@@ -18,16 +18,17 @@ from igsr_lab.bench.comparison import MIN_FLIP
 #: How figures are measured, for the JSON and below tables.
 PROTOCOL = (
     "ms is the minimum over the repeats, ms_median their median. Stages are timed in the renderer "
-    "on arrays that are converted once, bin within rasterize and rasterize_backward, on the gpu "
-    "with upload and read-back; fit steps are timed from outside, as the mean over views of each "
-    "view's minimum. peak_gflops is a loop of multiply-adds on all cores right after the row, a "
-    "multiply-add counting as two; fraction_of_peak counts the arithmetic of blended pairs only. "
-    "Errors are against the f64 reference on the same f32 inputs: for pictures absolute, over "
-    "color and alpha; for gradients relative to the largest of their kind, for the worst kind. A "
-    "pixel is left out only within the band of docs/how-it-works/numerics.md, if it differs by "
-    f"more than the bound or its transmittance by more than {MIN_FLIP:g} of itself (band_pixels, "
-    "left_out_pixels); splats at equal depth up to rounding are in the backend's order. "
-    "bytes_per_splat is the fit's peak memory without the picture's, for fits on the cores."
+    "on arrays that are converted once; the time of bin is part of rasterize and of "
+    "rasterize_backward. GPU times include upload and read-back. Fit steps are timed from outside: "
+    "the mean over views of each view's minimum. peak_gflops is the rate of a loop of "
+    "multiply-adds on all cores, measured right after the row; a multiply-add counts as two operations. "
+    "fraction_of_peak counts the arithmetic of blended pairs only. Errors are against the f64 "
+    "reference on the same f32 inputs: absolute for pictures, over color and alpha; for gradients "
+    "divided by the largest gradient of the same parameter, for the worst parameter. A pixel is "
+    "left out only within the band of docs/how-it-works/numerics.md, if it differs by more than "
+    f"the bound or its transmittance by more than {MIN_FLIP:.1%} (band_pixels, left_out_pixels). "
+    "Splats at equal depth up to rounding are in the backend's order. bytes_per_splat is the peak "
+    "memory of a CPU fit without the picture's buffers."
 )
 #: Columns, and whether they are numbers.
 HEADINGS = {
