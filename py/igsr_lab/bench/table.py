@@ -21,7 +21,7 @@ PROTOCOL = (
     "on arrays that are converted once; the time of bin is part of rasterize and of "
     "rasterize_backward. GPU times include upload and read-back. Fit steps are timed from outside: "
     "the mean over views of each view's minimum. peak_gflops is the rate of a loop of "
-    "multiply-adds on all cores, measured right after the row; a multiply-add counts as two operations. "
+    "multiply-adds on all cores, measured right after the row; a multiply-add counts as two. "
     "fraction_of_peak counts the arithmetic of blended pairs only. Errors are against the f64 "
     "reference on the same f32 inputs: absolute for pictures, over color and alpha; for gradients "
     "divided by the largest gradient of the same parameter, for the worst parameter. A pixel is "
