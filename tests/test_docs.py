@@ -39,7 +39,7 @@ from igsr_lab import __main__ as lab
 NOT_RUN = {
     "docs/guides/blocks.md": 1,
     "README.md": 2,
-    "docs/getting-started.md": 3,
+    "docs/getting-started.md": 2,
     "docs/guides/cameras.md": 2,
     "docs/guides/denoising.md": 2,
     "docs/guides/installation.md": 2,
