@@ -79,7 +79,7 @@ StartOption = Annotated[
     option(
         "--start",
         metavar="NAME",
-        help="Initialization: auto, points, depths, hull, sift, rays or random.",
+        help="Initialization: auto, points, depths, hull, rays or random.",
         panel=ADVANCED,
     ),
 ]
