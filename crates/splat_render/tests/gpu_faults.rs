@@ -190,6 +190,23 @@ fn density_control_beyond_the_memory_is_one_message_and_keeps_the_splats() {
     assert!(fit.device.loss().unwrap() > 0.0);
 }
 
+/// The state after some steps, of which submission `failing` fails, and how often the fit failed.
+fn fit_with_failure(fit: &mut Fit, gpu: &Gpu, steps: u32, failing: u64) -> (FitState, u32) {
+    gpu.fail_submission(failing);
+    let mut failures = 0;
+    for step in 1..=steps {
+        while fit.step(step).is_err() {
+            failures += 1;
+        }
+    }
+    loop {
+        match fit.device.download() {
+            Ok(state) => return (state, failures),
+            Err(_) => failures += 1,
+        }
+    }
+}
+
 #[test]
 fn a_submission_that_fails_loses_no_step_and_repeats_none() {
     let gpu = Arc::new(gpu());
@@ -197,19 +214,7 @@ fn a_submission_that_fails_loses_no_step_and_repeats_none() {
     let end = |failing: u64| {
         let mut fit = Fit::new(&gpu, 200);
         fit.make_wide();
-        gpu.fail_submission(failing);
-        let mut failures = 0;
-        for step in 1..=4 {
-            while fit.step(step).is_err() {
-                failures += 1;
-            }
-        }
-        loop {
-            match fit.device.download() {
-                Ok(state) => return (state, failures),
-                Err(_) => failures += 1,
-            }
-        }
+        fit_with_failure(&mut fit, &gpu, 4, failing)
     };
     let (expected, none) = end(0);
     assert_eq!(none, 0);
@@ -226,4 +231,17 @@ fn a_submission_that_fails_loses_no_step_and_repeats_none() {
     gpu.fail_submission(0);
     // Four steps, the status, the steps again, each with a separate status.
     assert!(failed >= 4 + 1 + 2 * 4, "{failed}");
+}
+
+#[test]
+fn a_batch_is_done_once_if_its_flag_cannot_be_read() {
+    let gpu = Arc::new(gpu());
+    let end = |failing| fit_with_failure(&mut Fit::new(&gpu, 200), &gpu, 20, failing);
+    let (expected, _) = end(0);
+    // Step 16, the copy of the flag, and the steps after it.
+    for failing in 16..=18 {
+        let (state, failures) = end(failing);
+        assert!(state == expected && failures == 1, "submission {failing}");
+    }
+    gpu.fail_submission(0);
 }

@@ -11,7 +11,6 @@ struct Style {
     depth_unit: f32,
     // Radius of points, in pixels.
     radius: f32,
-    unused: f32,
 }
 
 const SPLATS = 0u;

@@ -15,24 +15,26 @@ const UNTIMED: Timed = Timed { frames: 0, least: f32::INFINITY };
 /// Times both renderers, and again when the number of splats or pixels doubles or halves.
 #[derive(Debug)]
 pub struct DrawingChoice {
-    /// Logarithms of the splats and pixels for which the times hold.
+    /// The splats and pixels for which the times hold.
     work: [u32; 2],
+    has_memory: bool,
     blending: Timed,
     rasterizer: Timed,
 }
 
 impl DrawingChoice {
     pub fn new() -> Self {
-        Self { work: [0; 2], blending: UNTIMED, rasterizer: UNTIMED }
+        Self { work: [0; 2], has_memory: true, blending: UNTIMED, rasterizer: UNTIMED }
     }
 
     /// Whether the rasterizer draws the next frame. Blending goes first, and on without times.
     pub fn rasterizes(&mut self, splats: u32, pixels: u32) -> bool {
-        let work = [splats, pixels].map(|n| n.max(1).ilog2());
-        if work != self.work {
+        let work = [splats, pixels];
+        let is_other = |(now, before): (u32, u32)| now / 2 >= before || before / 2 >= now;
+        if work.into_iter().zip(self.work).any(is_other) {
             *self = Self { work, ..Self::new() };
         }
-        if self.blending.frames < TIMED {
+        if self.blending.frames < TIMED || !self.has_memory {
             return false;
         }
         self.rasterizer.frames < TIMED || self.rasterizer.least < self.blending.least
@@ -47,9 +49,9 @@ impl DrawingChoice {
         }
     }
 
-    /// Leaves the drawing to blending, for example without memory for the rasterizer.
+    /// Leaves the drawing to blending: the rasterizer lacks memory.
     pub fn rule_out_rasterizer(&mut self) {
-        self.rasterizer = Timed { frames: TIMED, ..UNTIMED };
+        self.has_memory = false;
     }
 }
 
@@ -88,10 +90,11 @@ mod tests {
     fn much_more_work_is_timed_again() {
         let mut choice = DrawingChoice::new();
         drawn(&mut choice, 20, 3.0, 1.0);
-        assert!(choice.rasterizes(1020, 5000));
-        assert!(!choice.rasterizes(2048, 5000));
+        assert!(choice.rasterizes(1990, 5000));
+        assert!(!choice.rasterizes(2000, 5000));
         drawn(&mut choice, 20, 3.0, 1.0);
-        assert!(!choice.rasterizes(1000, 50_000));
+        assert!(choice.rasterizes(501, 5000));
+        assert!(!choice.rasterizes(1000, 10_000));
     }
 
     #[test]
@@ -101,6 +104,7 @@ mod tests {
         drawn(&mut choice, TIMED, 3.0, 1.0);
         assert!(choice.rasterizes(1000, 5000));
         choice.rule_out_rasterizer();
+        choice.timed(true, 0.1);
         assert!(!choice.rasterizes(1000, 5000));
     }
 }

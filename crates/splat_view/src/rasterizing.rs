@@ -53,6 +53,11 @@ impl Rasterizing {
         Ok(PictureBuffers { size, picture, place, bindings })
     }
 
+    /// Whether the next picture has room for pairs that an earlier one had not.
+    pub fn is_short(gpu: &Gpu, buffers: &mut PictureBuffers) -> bool {
+        buffers.picture.is_short(gpu)
+    }
+
     /// Draws a model onto columns `begin..end` of a canvas and submits the work. Blending draws it if there
     /// was no room for its pairs.
     pub fn draw(
@@ -99,6 +104,8 @@ impl Rasterizing {
         pass.set_scissor_rect(begin, 0, end - begin, camera.height);
         let (arguments, [picture, quads]) = ResidentPicture::draws(model.splats());
         self.0.draw_indirect(&mut pass, &buffers.bindings, (arguments, picture));
+        // Splats are projected to these columns, and the style is the whole canvas's.
+        pass.set_viewport(begin as f32, 0.0, camera.width as f32, camera.height as f32, 0.0, 1.0);
         blending.draw(&mut pass, model, (arguments, quads));
         drop(pass);
         gpu.queue().submit([encoder.finish()]);

@@ -71,6 +71,9 @@ impl Session {
         if now.duration_since(self.polled) >= POLL {
             self.polled = now;
             self.poll_files();
+            if self.painter.is_short() {
+                self.screen.window.request_redraw();
+            }
         }
         if self.due.is_some_and(|due| due <= now) {
             self.due = None;

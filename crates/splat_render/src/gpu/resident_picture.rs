@@ -17,8 +17,8 @@ use crate::error::{Error, Result};
 const PAIRS_PER_SPLAT: u32 = 4;
 const LEAST_PAIRS: u32 = 1 << 18;
 
-/// Scenes and sizes whose commands are kept: two scenes side by side.
-const KEPT: usize = 2;
+/// Pictures after which unused commands are dropped: two scenes side by side are drawn in turns.
+const KEPT: u32 = 4;
 
 /// A picture on the device, with the buffers of its stages.
 #[derive(Debug)]
@@ -29,6 +29,8 @@ pub struct ResidentPicture {
     pairs: PairBins,
     /// Pairs that `pairs` has room for.
     capacity: u32,
+    /// Most pairs of the pictures whose number has arrived.
+    needed: u32,
     kept: Vec<Prepared>,
 }
 
@@ -40,6 +42,8 @@ struct Prepared {
     bin: Vec<Op>,
     rasterize: Vec<Op>,
     count: Count,
+    /// Pictures since it was used.
+    age: u32,
 }
 
 /// The number of pairs, on its way back.
@@ -106,6 +110,7 @@ impl ResidentPicture {
             buffers: PictureBuffers::new(gpu, pixels)?,
             pairs: PairBins::new(gpu, 0, tile_count(width, height))?,
             capacity: 0,
+            needed: 0,
             kept: Vec::new(),
         })
     }
@@ -117,7 +122,7 @@ impl ResidentPicture {
 
     /// A buffer with the arguments of two indirect draws, and their offsets. If the pairs of the last
     /// frame fit, the first draws a triangle and the second nothing. Else the picture is empty, the first
-    /// draws nothing and the second four vertices for each splat in order; a later frame makes room.
+    /// draws nothing and the second four vertices for each splat in order.
     pub fn draws(splats: &ResidentSplats) -> (&wgpu::Buffer, [u64; 2]) {
         (&splats.bins.dispatches, [40, 24])
     }
@@ -169,16 +174,22 @@ impl ResidentPicture {
         self.kept.iter_mut().for_each(|prepared| prepared.count.submitted());
     }
 
+    /// Whether pairs did not fit in the last pictures whose number of pairs has arrived, and will in the
+    /// next one. They never do if one binding cannot hold them.
+    pub fn is_short(&mut self, gpu: &Gpu) -> bool {
+        for prepared in &mut self.kept {
+            self.needed = self.needed.max(prepared.count.arrived().unwrap_or(0));
+        }
+        self.needed > self.capacity && self.capacity < pair_limit(gpu, 1)
+    }
+
     /// Makes room for the pairs of earlier frames, and some more, so that not every frame of an approach
     /// makes room.
     fn make_room(&mut self, gpu: &Gpu, splats: u32) -> Result<()> {
-        let counted = self.kept.iter_mut().filter_map(|prepared| prepared.count.arrived()).max();
-        let needed = counted.map_or(0, |pairs| pairs.saturating_add(pairs / 4));
-        let limit = pair_limit(gpu, 1);
-        let first = splats.saturating_mul(PAIRS_PER_SPLAT).max(LEAST_PAIRS);
-        let room = needed.max(first).min(limit);
-        let is_short = counted.is_some_and(|pairs| pairs > self.capacity);
-        if self.capacity == 0 || (is_short && room > self.capacity) {
+        if self.is_short(gpu) || self.capacity == 0 {
+            let first = splats.saturating_mul(PAIRS_PER_SPLAT).max(LEAST_PAIRS);
+            let some_more = self.needed.saturating_add(self.needed / 4);
+            let room = some_more.max(first).min(pair_limit(gpu, 1));
             self.kept.clear();
             self.pairs = PairBins::new(gpu, room, tile_count(self.width, self.height))?;
             self.capacity = room;
@@ -188,11 +199,10 @@ impl ResidentPicture {
 
     fn prepared(&mut self, gpu: &Gpu, splats: &ResidentSplats, size: [u32; 2]) -> &mut Prepared {
         let drawn = splats.projection();
+        self.kept.iter_mut().for_each(|kept| kept.age += 1);
+        self.kept.retain(|kept| kept.age <= KEPT);
         let is_same = |kept: &Prepared| kept.size == size && kept.splats2d == *drawn.splats2d;
         let at = self.kept.iter().position(is_same).unwrap_or_else(|| {
-            if self.kept.len() == KEPT {
-                self.kept.remove(0);
-            }
             let tiles = tile_count(size[0], size[1]);
             let chunk = TileChunk::new(gpu, Chunk::whole(tiles, splats.len(), self.capacity));
             let mut bin = splats.bins.count_ops(gpu, drawn, &chunk);
@@ -203,9 +213,11 @@ impl ResidentPicture {
                 bin,
                 rasterize: rasterize_ops(gpu, drawn, &chunk, &self.pairs, &self.buffers),
                 count: Count::new(gpu),
+                age: 0,
             });
             self.kept.len() - 1
         });
+        self.kept[at].age = 0;
         &mut self.kept[at]
     }
 }

@@ -180,7 +180,8 @@ impl Gpu {
             });
         }
         self.host_waits.fetch_add(1, Ordering::Relaxed);
-        self.wait(wgpu::PollType::wait_indefinitely())?;
+        self.wait(wgpu::PollType::wait_indefinitely())
+            .inspect_err(|_| buffers.iter().for_each(|(buffer, _)| buffer.unmap()))?;
         buffers.iter().map(|&(buffer, bytes)| self.mapped(buffer, bytes)).collect()
     }
 
@@ -203,7 +204,8 @@ impl Gpu {
         buffer: &wgpu::Buffer,
         bytes: u64,
     ) -> Result<Vec<u8>> {
-        self.wait(wgpu::PollType::Wait { submission_index: Some(submission), timeout: None })?;
+        self.wait(wgpu::PollType::Wait { submission_index: Some(submission), timeout: None })
+            .inspect_err(|_| buffer.unmap())?;
         self.mapped(buffer, bytes)
     }
 

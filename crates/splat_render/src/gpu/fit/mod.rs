@@ -3,7 +3,7 @@
 //!
 //! Buffers for (splat, tile) pairs have a capacity. A step that needs more detects it on the device and
 //! leaves the state unchanged, as do the steps after it. The host reads that flag some steps late,
-//! enlarges the buffers and repeats those steps, so that the device never waits for the host.
+//! enlarges the buffers and repeats those steps, so that steps do not wait for the host.
 //!
 //! Colors of splats that a step does not see wait ([`crate::fit_device::COLOR_WAIT`]).
 //!
@@ -46,7 +46,7 @@ pub use plan::PlannedFit;
 use scene::{Scene, pair_buffers};
 
 /// Steps in a batch. After each, the host asks whether all pairs fitted; it reads the answer after the next
-/// batch, or at once if it also reads sums of the steps.
+/// batch, or at once if it also reads sums of the steps, for which there is room for one batch.
 const STEPS_AHEAD: usize = 16;
 
 /// Offset of the status's overflow, bytes.
@@ -385,14 +385,18 @@ impl GpuFit {
         Ok(Some(bytemuck::pod_read_unaligned(&flag)))
     }
 
-    /// After every batch of steps: makes sure that the batch before has been done, while this one is under
-    /// way.
-    fn confirm(&mut self) -> Result<()> {
-        if !self.pending.len().is_multiple_of(STEPS_AHEAD) {
-            return Ok(());
-        }
-        if self.pending.iter().any(|(input, _)| has_sums(input)) {
+    /// Before the next step: after every batch, makes sure that the batch before has been done, while this
+    /// one is under way.
+    fn confirm(&mut self, next: &StepInput) -> Result<()> {
+        let steps = self.pending.len();
+        let sums = has_sums(next) || self.pending.iter().any(|(input, _)| has_sums(input));
+        let most = if sums { STEPS_AHEAD - 1 } else { 2 * STEPS_AHEAD };
+        if self.redone.is_some() || steps > most {
+            // Steps that are to be done again come first.
             return self.settle();
+        }
+        if steps == 0 || !steps.is_multiple_of(STEPS_AHEAD) {
+            return Ok(());
         }
         match self.read_flag()? {
             None => {}
@@ -593,11 +597,7 @@ impl FitDevice for GpuFit {
             let frame = &self.frames[photo.frame];
             (frame.width, frame.height)
         }))?;
-        // Steps that are to be done again come first; sums are kept for one batch.
-        let most = if has_sums(input) { STEPS_AHEAD } else { 2 * STEPS_AHEAD };
-        if self.redone.is_some() || self.pending.len() >= most {
-            self.settle()?;
-        }
+        self.confirm(input)?;
         let adam = input.adam();
         if self.waiting.must_end_before(&adam) {
             self.settle()?;
@@ -607,7 +607,7 @@ impl FitDevice for GpuFit {
         self.enqueue(input, self.pending.len(), waiting, false)?;
         self.pending.push((*input, waiting));
         self.waiting.add(&adam);
-        self.confirm()
+        Ok(())
     }
 
     fn camera_gradients(&mut self) -> Result<Vec<CameraGradient>> {

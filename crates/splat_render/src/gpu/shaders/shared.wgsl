@@ -114,7 +114,7 @@ struct Splat2d {
     radii: vec2<f32>,
 }
 
-// Key of culled splats: they are last, or dropped.
+// Key of culled splats, which the sort leaves out.
 const CULLED_KEY = 0xffffffffu;
 
 // Keys sort as depths do, negative ones included.

@@ -148,9 +148,7 @@ impl<'a> Document<'a> {
 
     fn read(&self, path: &Path, uri: &str) -> Result<Vec<u8>> {
         use std::io::Read;
-        let refers = |to: &str| {
-            self.bad(format!("refers to {:?}, which {to}", beginning(uri)))
-        };
+        let refers = |to: &str| self.bad(format!("refers to {:?}, which {to}", beginning(uri)));
         let file = open_file(path).map_err(|error| match error {
             Error::File { reason, .. } => refers(&reason),
             error => error,
