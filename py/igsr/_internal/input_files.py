@@ -48,18 +48,22 @@ def read_file(path: str | os.PathLike[str], limit: int = MAX_BYTES) -> bytes:
         return file.read(size)
 
 
-def read_json(path: Path, limit: int = MAX_JSON_BYTES) -> Any:
-    """Read a JSON file, of which at most ``MAX_JSON_VALUES`` values are parsed.
+def read_json(path: Path, limit: int = MAX_JSON_BYTES, most: int = MAX_JSON_VALUES) -> Any:
+    """Read a JSON file; raises as ``read_file`` and ``parse_json``."""
+    return parse_json(read_file(path, limit), most)
+
+
+def parse_json(content: bytes, most: int = MAX_JSON_VALUES) -> Any:
+    """Parse JSON of at most ``most`` values.
 
     Raises:
-        OSError: as ``read_file``, or the file has more values.
+        OSError: it has more values.
         ValueError: it is not JSON or nests too deeply.
     """
-    content = read_file(path, limit)
     # Each value but the first follows one of these.
-    if sum(map(content.count, (b",", b"[", b"{"))) > MAX_JSON_VALUES:
-        reason = f"it has more than {MAX_JSON_VALUES} values"
-        raise OSError(errno.EFBIG, reason, str(path))
+    if sum(map(content.count, (b",", b"[", b"{"))) > most:
+        reason = f"it has more than {most} values"
+        raise OSError(errno.EFBIG, reason)
     try:
         return json.loads(content)
     except RecursionError as error:

@@ -12,7 +12,7 @@ from typing import IO, Any
 import numpy as np
 import numpy.typing as npt
 
-from igsr._internal.input_files import open_file
+from igsr._internal.input_files import MAX_JSON_VALUES, open_file, parse_json
 
 #: Exceptions of zipfile, numpy and json for damaged files. RuntimeError: encrypted members, an
 #: unknown zip version or nested members; syntax errors: invalid array headers, by numpy's own
@@ -30,6 +30,8 @@ DAMAGE = (
     zipfile.BadZipFile,
     zlib.error,
 )
+#: Bytes that are read at once: zipfile would hold an array twice.
+_PIECE = 1 << 20
 _HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
@@ -40,23 +42,36 @@ def stored_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
     """The arrays of a file that ``np.savez`` wrote: numbers, not compressed, by name.
 
     Raises:
-        OSError, ValueError, ...: ``DAMAGE``; the file is damaged or of another kind.
+        OSError, ValueError, ...: ``DAMAGE``; the file is damaged, of another kind or larger than
+            the available memory.
     """
+    from igsr.capture.memory_check import available_memory  # which imports this file
+
     with open_file(path) as file, zipfile.ZipFile(file) as archive:
+        size, free = sum(member.file_size for member in archive.infolist()), available_memory()
+        if size > free:
+            raise ValueError(f"it has {size} bytes, but {free} bytes of memory are free")
         return {
             member.filename.removesuffix(".npy"): _read_member(archive, member)
             for member in archive.infolist()
         }
 
 
-def stored_array(path: Path) -> npt.NDArray[Any]:
-    """The array of a file that ``np.save`` wrote: numbers.
+def stored_array(path: Path, most: int) -> npt.NDArray[Any]:
+    """The array of a file that ``np.save`` wrote: at most ``most`` numbers.
 
     Raises:
-        OSError, ValueError, ...: ``DAMAGE``; the file is damaged or of another kind.
+        OSError, ValueError, ...: ``DAMAGE``; the file is damaged, of another kind or too large.
     """
     with open_file(path) as file:
-        return _read_array(file, path.stat().st_size)
+        return _read_array(file, path.stat().st_size, most)
+
+
+def stored_json(array: npt.NDArray[Any], most: int = MAX_JSON_VALUES) -> Any:
+    """Parse an array of JSON text of at most ``most`` values; raises as ``parse_json``."""
+    if array.nbytes > 32 * most:
+        raise ValueError(f"its JSON has more than {32 * most} bytes")
+    return parse_json(array.tobytes(), most)
 
 
 def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> npt.NDArray[Any]:
@@ -66,8 +81,8 @@ def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> npt.NDArr
         return _read_array(file, member.file_size)
 
 
-def _read_array(file: IO[bytes], size: int) -> npt.NDArray[Any]:
-    """The array in an open file of ``size`` bytes."""
+def _read_array(file: IO[bytes], size: int, most: int | None = None) -> npt.NDArray[Any]:
+    """The array in an open file of ``size`` bytes, of at most ``most`` numbers."""
     try:
         read_header = _HEADERS[np.lib.format.read_magic(file)]
         shape, fortran, dtype = read_header(file)
@@ -76,9 +91,12 @@ def _read_array(file: IO[bytes], size: int) -> npt.NDArray[Any]:
     if dtype.hasobject or dtype.kind not in "biuf":
         raise ValueError("it holds no numbers")
     count = math.prod(shape)  # Python integers: a hostile shape cannot overflow
-    # One byte more than promised, so that a longer array shows as well as a shorter one.
-    data = file.read(min(size, count * dtype.itemsize) + 1)
-    if len(data) != count * dtype.itemsize:
+    if most is not None and count > most:
+        raise ValueError(f"it has more than the limit of {most} numbers; make it smaller")
+    length = count * dtype.itemsize
+    if length != size - file.tell():
         raise ValueError("it has an array of another size than its header says")
-    array = np.frombuffer(bytearray(data), dtype=dtype)
-    return array.reshape(shape, order="F" if fortran else "C")
+    data = np.empty(length, np.uint8)
+    for begin in range(0, length, _PIECE):
+        data[begin : begin + _PIECE] = np.frombuffer(file.read(_PIECE), np.uint8)
+    return data.view(dtype).reshape(shape, order="F" if fortran else "C")

@@ -12,10 +12,11 @@ import numpy as np
 
 from igsr._internal.atomic_write import atomic_write
 from igsr._internal.part_usage import Usage
-from igsr._internal.untrusted_npz import DAMAGE, stored_arrays
+from igsr._internal.untrusted_npz import DAMAGE, stored_arrays, stored_json
 from igsr.cameras.estimate import Estimate
 from igsr.cameras.found_cameras import FoundCameras
 from igsr.capture import Camera, Points
+from igsr.capture.read_transforms import MAX_VALUES
 from igsr.capture.types import PoseEvidence, Tracks
 from igsr.capture.undistort import Lens
 from igsr.errors import IgsrError
@@ -91,7 +92,7 @@ def read_cameras_file(path: Path) -> KeptCameras:
     """
     try:
         arrays = stored_arrays(path)
-        about = json.loads(arrays[_ABOUT].tobytes())
+        about = stored_json(arrays[_ABOUT], MAX_VALUES)
         if about["format"] != FORMAT:
             raise ValueError(f"it is not of format {FORMAT}")
         return KeptCameras(_found(arrays, about), _sizes(about["photos"]), Usage.of(about["usage"]))

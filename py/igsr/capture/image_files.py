@@ -255,7 +255,9 @@ def read_depth(path: Path, unit: float | None, photo: tuple[int, int]) -> npt.ND
 
 def _picture(path: Path, most: int) -> Numbers:
     with open_image(path) as image:
-        _check_pixels(path, image.width * image.height, most)
+        pixels = image.width * image.height
+        if pixels > most:
+            raise IgsrError(f"{path} has {pixels} pixels, more than its photo; give smaller depth")
         load_pixels(image, path)
         if image.mode not in ("I", "I;16", "I;16B", "F"):
             raise IgsrError(
@@ -263,11 +265,6 @@ def _picture(path: Path, most: int) -> Numbers:
                 "EXR"
             )
         return np.array(image)
-
-
-def _check_pixels(path: Path, pixels: int, most: int) -> None:
-    if pixels > most:
-        raise IgsrError(f"{path} has {pixels} pixels, more than its photo; give smaller depth")
 
 
 def _exr(path: Path, most: int) -> Numbers:
@@ -279,10 +276,9 @@ def _exr(path: Path, most: int) -> Numbers:
 
 def _npy(path: Path, most: int) -> Numbers:
     try:
-        stored = stored_array(path)
+        stored = stored_array(path, most)
     except DAMAGE as error:
         raise IgsrError(f"{path} cannot be read as depth: {error}") from error
-    _check_pixels(path, stored.size, most)
     if stored.dtype.kind not in "uif":
         raise IgsrError(f"{path} holds no numbers; give depth as a .npy array of [H, W]")
     if stored.ndim == 3 and 1 in (stored.shape[0], stored.shape[2]):

@@ -38,6 +38,10 @@ _PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"
 _FISHEYE = "OPENCV_FISHEYE"
 _EQUIRECTANGULAR = "EQUIRECTANGULAR"
 
+#: Limits of a file, for 100 000 cameras: each has 30 values.
+_MAX_BYTES = 128 << 20
+MAX_VALUES = 1 << 22
+
 # NeRF Synthetic omits the suffix.
 _OMITTED_SUFFIXES = (".png", ".jpg", ".jpeg")
 
@@ -86,9 +90,12 @@ def describe_split_transforms(folder: Path) -> DescribedCapture:
     return DescribedCapture(folder, shots, lambda: None)
 
 
-def read_cameras(path: Path) -> list[tuple[str, Camera]]:
-    """Read the photos' names and cameras of a ``cameras.json`` that igsr wrote."""
-    document = _read_json(path)
+def read_cameras(path: Path, most: int = MAX_VALUES) -> list[tuple[str, Camera]]:
+    """Read the photos' names and cameras of a ``cameras.json`` that igsr wrote.
+
+    Files of more than ``most`` values are refused.
+    """
+    document = _read_json(path, most)
     if document.get("camera_model") != "PINHOLE":
         raise IgsrError(f"{path}: camera_model must be PINHOLE, as igsr writes it")
     cameras = []
@@ -124,9 +131,9 @@ def read_lens(path: Path) -> WideFisheye:
     return wide
 
 
-def _read_json(path: Path) -> dict[str, Any]:
+def _read_json(path: Path, most: int = MAX_VALUES) -> dict[str, Any]:
     try:
-        document = read_json(path)
+        document = read_json(path, _MAX_BYTES, most)
     except OSError as error:
         raise IgsrError(f"{path} cannot be read ({error.strerror}); check it") from error
     except ValueError as error:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from igsr._internal.input_files import open_file
 from igsr.errors import IgsrError
 
 UInt8 = npt.NDArray[np.uint8]
@@ -122,9 +123,10 @@ def _opened(path: Path) -> Iterator[Any]:
     import av
 
     try:
+        open_file(path).close()
         with av.open(str(path)) as container:
             yield container
-    except (av.FFmpegError, IndexError, ValueError) as error:
+    except (av.FFmpegError, IndexError, OSError, ValueError) as error:
         raise IgsrError(f"{path} cannot be read as a video; save it as MP4 again") from error
 
 

@@ -13,6 +13,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from igsr._internal.atomic_write import atomic_write
+from igsr._internal.input_files import open_file, parse_json
 from igsr.denoiser.architecture import Architecture
 from igsr.denoiser.network import DenoiserNetwork
 from igsr.errors import IgsrError
@@ -61,38 +62,48 @@ def load_network(path: str | os.PathLike[str] | None = None) -> DenoiserNetwork:
         )
     path = SHIPPED if path is None else Path(path)
     try:
+        open_file(path).close()
         with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            architecture = _architecture((file.metadata() or {}).get("architecture"), path)
+            with torch.device("meta"):  # takes no memory
+                network = DenoiserNetwork(architecture)
+            weights = _weights(file, network, path)
     except FileNotFoundError as error:
         raise IgsrError(f"{path} does not exist; give a denoiser's .safetensors file") from error
     except (SafetensorError, OSError) as error:
         raise IgsrError(
             f"{path} is not a complete .safetensors file; copy it again or train one"
         ) from error
-    network = DenoiserNetwork(_architecture(metadata.get("architecture"), path))
-    expected = network.state_dict()
-    for name, tensor in expected.items():
-        if name not in weights:
-            raise IgsrError(f"{path} lacks the weight {name}; it was written by another version")
-        if weights[name].shape != tensor.shape or not weights[name].is_floating_point():
-            raise IgsrError(
-                f"{path}: {name} has shape {list(weights[name].shape)}, but its architecture "
-                f"needs {list(tensor.shape)}"
-            )
-        if not torch.isfinite(weights[name]).all():
-            raise IgsrError(f"{path}: {name} holds a NaN or infinite weight; train it again")
-    unknown = sorted(set(weights) - set(expected))
-    if unknown:
-        raise IgsrError(f"{path} has an unknown weight {unknown[0]}")
-    network.load_state_dict({name: tensor.float() for name, tensor in weights.items()})
+    network.load_state_dict(weights, assign=True)
     # A third faster on CPUs.
     return network.to(memory_format=torch.channels_last).eval()
 
 
+def _weights(file: Any, network: DenoiserNetwork, path: Path) -> dict[str, torch.Tensor]:
+    """The network's weights; their shapes are compared before any is read."""
+    names, expected = set(file.keys()), network.state_dict()
+    for name, tensor in expected.items():
+        if name not in names:
+            raise IgsrError(f"{path} lacks the weight {name}; it was written by another version")
+        part = file.get_slice(name)
+        shape = list(part.get_shape())
+        if shape != list(tensor.shape) or not part.get_dtype().startswith(("F", "BF")):
+            raise IgsrError(
+                f"{path}: {name} has shape {shape}, but its architecture needs {list(tensor.shape)}"
+            )
+    unknown = sorted(names - set(expected))
+    if unknown:
+        raise IgsrError(f"{path} has an unknown weight {unknown[0]}")
+    weights = {name: file.get_tensor(name).float() for name in expected}
+    for name, tensor in weights.items():
+        if not torch.isfinite(tensor).all():
+            raise IgsrError(f"{path}: {name} holds a NaN or infinite weight; train it again")
+    return weights
+
+
 def _architecture(text: str | None, path: Path) -> Architecture:
     try:
-        settings = json.loads(text or "")
+        settings = parse_json((text or "").encode())
         if any(settings.get(name, value) != value for name, value in _FORMER_SETTINGS.items()):
             raise IgsrError("igsr no longer has its settings; train it again")
         return Architecture(settings["width"], tuple(settings["blocks"]))

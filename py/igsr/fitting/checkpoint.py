@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from igsr import _core
 from igsr._internal.atomic_write import atomic_write, check_writable
-from igsr._internal.untrusted_npz import DAMAGE, stored_arrays
+from igsr._internal.untrusted_npz import DAMAGE, stored_arrays, stored_json
 from igsr.errors import IgsrError
 from igsr.fitting.settings import FitSettings
 
@@ -135,7 +135,7 @@ def load_checkpoint(path: Path) -> tuple[State, dict[str, Any]]:
         raise IgsrError(f"There is no checkpoint {path} to resume; leave --resume out.")
     try:
         state = stored_arrays(path)
-        settings = json.loads(state.pop(SETTINGS).tobytes())
+        settings = stored_json(state.pop(SETTINGS))
         if not isinstance(settings, dict) or settings.pop("format", None) != FORMAT:
             raise ValueError(f"it is not of format {FORMAT}")
         seconds = settings.get("seconds")

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from igsr._internal.input_files import MAX_JSON_VALUES
 from igsr.capture.image_files import load_pixels, open_image
 from igsr.errors import IgsrError
 from igsr.rendering.live_models import LiveModel, live_models
@@ -35,7 +36,8 @@ BLACK = (0.0, 0.0, 0.0)
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png")
 #: Maximum longest side of the photos that the page gets.
 MAX_PHOTO_SIDE_PX = 1600
-#: Maximum bytes of a photo while it is decoded: 4 per pixel, or 8 if it is converted.
+#: Maximum bytes of a photo while it is decoded: 4 per pixel, or 8 if it is converted. A progressive
+#: JPEG has 6 more per pixel of the file, also if it is decoded at a part of its size.
 MAX_PHOTO_BYTES = 200_000_000
 #: Longest wait for cameras; thousands appear on the page later.
 READING_WAIT_S = 0.5
@@ -209,7 +211,7 @@ def _turn(lock: threading.Lock, is_open: Callable[[], bool]) -> Iterator[None]:
 def _cameras(file: Path) -> list[tuple[PageCamera, Path | None]]:
     """The cameras of a ``cameras.json`` and their photos; none if it cannot be read."""
     try:
-        cameras = cameras_of(file) if file.is_file() else []
+        cameras = cameras_of(file, MAX_JSON_VALUES) if file.is_file() else []
     except IgsrError:
         return []
     folder = os.path.realpath(file.parent)
@@ -233,10 +235,13 @@ def _jpeg(path: Path) -> bytes:
     size = (MAX_PHOTO_SIDE_PX, MAX_PHOTO_SIDE_PX)
     try:
         with open_image(path) as photo:
+            width, height = photo.size
             photo.draft("RGB", size)
-            copies = 1 if photo.mode == "RGB" and "progressive" not in photo.info else 2
-            if 4 * copies * photo.width * photo.height > MAX_PHOTO_BYTES:
-                raise IgsrError(f"it has {photo.width}x{photo.height} pixels, too many for a page")
+            needed = (4 if photo.mode == "RGB" else 8) * photo.width * photo.height
+            if "progressive" in photo.info:
+                needed += 6 * width * height
+            if needed > MAX_PHOTO_BYTES:
+                raise IgsrError(f"it has {width}x{height} pixels, too many for a page")
             load_pixels(photo, path)
             small = photo if photo.mode == "RGB" else photo.convert("RGB")
             small.thumbnail(size)

@@ -14,7 +14,7 @@ from typing import Any
 
 from igsr._internal.input_files import read_json
 from igsr.capture.load import describe_capture
-from igsr.capture.read_transforms import read_cameras
+from igsr.capture.read_transforms import MAX_VALUES, read_cameras
 from igsr.errors import IgsrError
 from igsr.rendering.scene_page import PageCamera
 
@@ -31,13 +31,18 @@ PROGRESS = "progress.json"
 #: write no progress for minutes.
 MAX_SILENCE_S = 600.0
 MISSING = "–"
+#: Values of a report; a few are kept parsed, which takes up to 100 bytes per value.
+MAX_REPORT_VALUES = 1 << 17
 
 
-def cameras_of(capture: Path) -> list[PageCamera]:
-    """Read the cameras of a ``cameras.json``, its folder, or any capture, without photos."""
+def cameras_of(capture: Path, most: int = MAX_VALUES) -> list[PageCamera]:
+    """Read the cameras of a ``cameras.json``, its folder, or any capture, without photos.
+
+    A ``cameras.json`` of more than ``most`` values is refused.
+    """
     for path in (capture, capture / CAMERAS):
         if path.name == CAMERAS and path.is_file():
-            return [PageCamera(name, camera) for name, camera in read_cameras(path)]
+            return [PageCamera(name, camera) for name, camera in read_cameras(path, most)]
     return [PageCamera(shot.name, shot.camera) for shot in describe_capture(capture).shots]
 
 
@@ -179,7 +184,7 @@ def _read(path: Path) -> dict[str, Any]:
 @lru_cache(maxsize=8)
 def _parsed(path: Path, *version: int) -> dict[str, Any]:
     try:
-        content = read_json(path)
+        content = read_json(path, most=MAX_REPORT_VALUES)
     except (OSError, ValueError):
         return {}
     return content if isinstance(content, dict) else {}
