@@ -15,6 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
+import pillow_heif
 import pytest
 import scenes
 from capture_files import write_transforms
@@ -192,6 +193,16 @@ def png(width, height, depth=8, color=2):
     )
 
 
+def test_a_small_heic_claims_no_vast_picture(tmp_path):
+    pillow_heif.register_heif_opener()
+    path = tmp_path / "a.heic"
+    Image.new("RGB", (64, 64)).save(path)
+    size, vast = struct.pack(">II", 64, 64), struct.pack(">II", 9000, 9000)
+    assert size in path.read_bytes()
+    path.write_bytes(path.read_bytes().replace(size, vast))
+    assert "claims 9000x9000 pixels" in refused(open_image, path)
+
+
 def npy(header):
     return b"\x93NUMPY\x01\0" + struct.pack("<H", len(header)) + header.encode()
 
@@ -319,6 +330,8 @@ def test_the_page_keeps_no_large_reports(tmp_path):
     assert live_view._cameras(tmp_path / "cameras.json") == []
     with pytest.raises(IgsrError, match="more than 1048576 values"):
         cameras_of(tmp_path / "cameras.json", 1 << 20)
+    with pytest.raises(IgsrError, match="frame 0"):  # captures may be larger
+        cameras_of(tmp_path / "cameras.json")
 
 
 @pytest.mark.parametrize("digits", [13, 4000])
