@@ -13,7 +13,7 @@ use zune_jpeg::zune_core::options::DecoderOptions;
 const FILE_MAX: u64 = 256 << 20;
 /// Longest side and largest number of pixels that are read; a pixel takes 4 bytes.
 const SIDE_MAX: usize = 16_384;
-const PIXELS_MAX: usize = 1 << 26;
+const PIXELS_MAX: usize = 1 << 27;
 
 #[derive(Debug, Clone)]
 pub struct Photo {
@@ -82,18 +82,22 @@ fn is_png(bytes: &[u8]) -> bool {
 
 fn jpeg(bytes: &[u8]) -> JpegDecoder<Cursor<&[u8]>> {
     let options = DecoderOptions::default()
-        .set_max_width(SIDE_MAX)
-        .set_max_height(SIDE_MAX)
+        // Both are u16 in a JPEG; check_size has a clearer sentence.
+        .set_max_width(usize::from(u16::MAX))
+        .set_max_height(usize::from(u16::MAX))
         .jpeg_set_out_colorspace(ColorSpace::RGBA);
     JpegDecoder::new_with_options(Cursor::new(bytes), options)
 }
 
 fn check_size(path: &Path, [width, height]: [usize; 2]) -> Result<()> {
-    if width.max(height) > SIDE_MAX || width * height > PIXELS_MAX {
-        let reason = format!("it has {width}x{height} pixels, more than {PIXELS_MAX}");
-        return Err(bad(path, reason));
-    }
-    Ok(())
+    let limit = if width.max(height) > SIDE_MAX {
+        format!("{SIDE_MAX} on a side")
+    } else if width * height > PIXELS_MAX {
+        format!("{PIXELS_MAX} in all")
+    } else {
+        return Ok(());
+    };
+    Err(Error::file(path, format!("has {width}x{height} pixels, more than {limit}; shrink it")))
 }
 
 pub fn read_photo(path: &Path) -> Result<Photo> {
@@ -204,19 +208,25 @@ mod tests {
         }
         std::fs::remove_file(path).expect("clean");
         let wide = png(png::ColorType::Grayscale, png::BitDepth::Eight, &[1, 2]);
-        // Sides of 16 383 in the header.
-        let mut huge = bytes.to_vec();
-        let frame = huge.windows(2).position(|w| w == [0xff, 0xc0]).expect("a frame");
-        huge[frame + 5..frame + 9].copy_from_slice(&[0x3f, 0xff, 0x3f, 0xff]);
-        for (name, bytes) in [
-            ("empty", &b""[..]),
-            ("text", b"no photo"),
-            ("cut.png", &wide[..30]),
-            ("huge.jpg", &huge),
-        ] {
+        for (name, bytes) in [("empty", &b""[..]), ("text", b"no photo"), ("cut.png", &wide[..30])]
+        {
             let path = file(name, bytes);
             let error = read_photo(&path).expect_err(name).to_string();
             assert!(error.contains(name) && error.contains("a PNG or JPEG"), "{error}");
+            std::fs::remove_file(path).expect("clean");
+        }
+        for ([height, width], limit) in [
+            ([16_384, 16_384], "more than 134217728 in all; shrink it"),
+            ([8, 16_385], "more than 16384 on a side; shrink it"),
+        ] {
+            let mut huge = bytes.to_vec();
+            let frame = huge.windows(2).position(|w| w == [0xff, 0xc0]).expect("a frame");
+            let sides = [height, width].map(u16::to_be_bytes).concat();
+            huge[frame + 5..frame + 9].copy_from_slice(&sides);
+            let path = file("huge.jpg", &huge);
+            let error = read_photo(&path).expect_err("too large").to_string();
+            let size = format!("has {width}x{height} pixels");
+            assert!(error.contains(&size) && error.contains(limit), "{error}");
             std::fs::remove_file(path).expect("clean");
         }
     }

@@ -11,7 +11,7 @@ pub const SPLATS_MAX: u64 = 1 << 30;
 /// Largest file that is read into memory whole. A `.ply` is not, and may be larger.
 pub const FILE_MAX: u64 = 4 << 30;
 /// Most bytes of an unpacked EXR file, and of one block: all channels of some rows or of a tile.
-pub const EXR_MAX: usize = 512 << 20;
+pub const EXR_MAX: usize = 1 << 30;
 pub const EXR_BLOCK_MAX: usize = 64 << 20;
 /// Splats in memory per byte of file. Files of real scenes unpack to 4 to 20 times their size.
 const UNPACKED_PER_BYTE: u64 = 64;

@@ -201,6 +201,17 @@ fn json_never_takes_much_memory() {
     let buffers: Vec<String> = (0..60).map(buffer).collect();
     let text = format!(r#"{{"asset":{{"version":"2.0"}},"buffers":[{}]}}"#, buffers.join(","));
     assert!(refused(text.as_bytes(), name.to_str().unwrap()).contains("no splats"));
+    // 60 hard links to it.
+    #[cfg(unix)]
+    {
+        let link =
+            |k| std::fs::hard_link(folder.join("aaaaaa.bin"), folder.join(format!("{k}.bin")));
+        (0..60).try_for_each(link).unwrap();
+        let buffer = |k| format!(r#"{{"byteLength":20971520,"uri":"{k}.bin"}}"#);
+        let buffers: Vec<String> = (0..60).map(buffer).collect();
+        let text = format!(r#"{{"asset":{{"version":"2.0"}},"buffers":[{}]}}"#, buffers.join(","));
+        assert!(refused(text.as_bytes(), name.to_str().unwrap()).contains("no splats"));
+    }
     // An index of levels that is all objects.
     let objects = "{\"\":0},".repeat(5_000_000);
     std::fs::write(folder.join(INDEX), format!("{{\"a\":[{objects}{{}}]}}")).unwrap();

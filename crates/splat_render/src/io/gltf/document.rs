@@ -110,11 +110,12 @@ impl<'a> Document<'a> {
             (Some(uri), _, _) => {
                 // One file may have many spellings and links.
                 let path = self.neighbor(uri)?;
-                match files.get(&path) {
+                let key = identity(&path);
+                match files.get(&key) {
                     Some(&place) => (place, None),
                     None => {
                         let read = self.read(&path, uri)?;
-                        files.insert(path, next);
+                        files.insert(key, next);
                         (next, Some(Cow::Owned(read)))
                     }
                 }
@@ -132,7 +133,7 @@ impl<'a> Document<'a> {
         Ok(place)
     }
 
-    /// The path, without links, of a file in the same folder or below it.
+    /// The path of a file in the same folder or below it.
     fn neighbor(&self, uri: &str) -> Result<PathBuf> {
         let name = percent_decoded(uri);
         let plain = Path::new(&name).components().all(|part| matches!(part, Component::Normal(_)));
@@ -142,8 +143,7 @@ impl<'a> Document<'a> {
                 "refers to {shown:?}; only files in its own folder are opened: write a .glb instead"
             )));
         }
-        let path = self.named.0.with_file_name(name);
-        Ok(path.canonicalize().unwrap_or(path))
+        Ok(self.named.0.with_file_name(name))
     }
 
     fn read(&self, path: &Path, uri: &str) -> Result<Vec<u8>> {
@@ -159,6 +159,18 @@ impl<'a> Document<'a> {
             .map_err(|e| refers(&format!("cannot be read ({e})")))?;
         Ok(bytes)
     }
+}
+
+/// A key that all names of a file share: on unix its device and number, which hard links share too.
+fn identity(path: &Path) -> PathBuf {
+    #[cfg(unix)]
+    let found = path.metadata().map(|file| {
+        use std::os::unix::fs::MetadataExt;
+        PathBuf::from(format!("{}/{}", file.dev(), file.ino()))
+    });
+    #[cfg(not(unix))]
+    let found = path.canonicalize();
+    found.unwrap_or_else(|_| path.to_owned())
 }
 
 fn split_glb<'a>(bytes: &'a [u8], named: &Named<'a>) -> Result<(&'a [u8], Option<&'a [u8]>)> {
