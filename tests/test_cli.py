@@ -279,13 +279,10 @@ def test_a_signal_while_cameras_are_sought_is_one_sentence(tmp_path, number, mon
     [
         (["convert", "{scene}", "{out}/levels", "--lod", 3], "out/.*/new/*", "nothing is written"),
         (["convert", "{scene}", "{out}/a.html"], "temporary/*", "nothing is written"),
-        (["view", "--web", "{scene}", "--cameras", "{capture}"], "temporary/*", "Interrupted"),
     ],
     ids=lambda given: given[0] if isinstance(given, list) else "",
 )
-def test_a_signal_leaves_no_temporary_files(
-    capture_path, tmp_path, command, begun, said, monkeypatch
-):
+def test_a_signal_leaves_no_temporary_files(tmp_path, command, begun, said, monkeypatch):
     """Folders of poses and fits are in the tests above."""
     places = {name: tmp_path / name for name in ("out", "temporary")}
     for folder in places.values():
@@ -293,11 +290,25 @@ def test_a_signal_leaves_no_temporary_files(
     monkeypatch.setenv("TMPDIR", str(places["temporary"]))
     scene = tmp_path / "scene.ply"
     scenes.splats(count=200_000).save(scene)
-    words = [str(word).format(scene=scene, capture=capture_path, **places) for word in command]
+    words = [str(word).format(scene=scene, **places) for word in command]
     ended = signal_when(lambda _: any(tmp_path.glob(begun)), signal.SIGTERM, *words)
     assert ended.returncode == 128 + signal.SIGTERM
     assert said in ended.stderr.splitlines()[-1]
     assert not any(any(folder.iterdir()) for folder in places.values())
+
+
+def test_sigterm_ends_the_window(tmp_path):
+    scenes.splats().save(tmp_path / "scene.ply")
+    code = f"""
+import sys
+from igsr.cli import main, view
+killer = "import os, signal, time; os.kill(os.getppid(), signal.SIGTERM); time.sleep(60)"
+view.PROGRAM = (sys.executable, "-c", killer)
+sys.argv = ["igsr", "view", "--screenshot", {str(tmp_path / "scene.ply")!r}]
+main()
+"""
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (ended.returncode, ended.stderr) == (128 + signal.SIGTERM, "Interrupted.\n")
 
 
 def test_a_signal_in_the_first_use_of_numpy_by_the_renderer_is_no_panic(tmp_path):
@@ -373,6 +384,12 @@ def test_a_full_disk_is_an_error_and_the_old_files_stay(fitted, capture_path, tm
     assert "unfinished" not in result.stderr, "messages name no temporary file"
     assert not (tmp_path / "orbit.mp4").exists()
     assert not any(path.is_file() for path in (tmp_path / "exr").rglob("*"))
+
+
+@pytest.mark.parametrize("command", ["clean", "compact", "eval", "render"])
+@pytest.mark.parametrize("folder", [".", "/"])
+def test_a_folder_is_no_scene(command, folder, igsr_here):
+    assert_fails(igsr_here(command, folder), f"{folder} is a folder; name a splat file")
 
 
 def test_out_must_be_a_folder(capture_path, tmp_path, igsr_here):

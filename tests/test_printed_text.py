@@ -114,6 +114,12 @@ def test_text_is_printed_as_it_is(printer, monkeypatch, capsys):
         assert code not in text
 
 
+def test_spaces_of_any_width_stay(capsys):
+    name = "Screenshot\xa01.00\u202fPM\u3000.png"
+    print_message(f"{name} is\nmissing")
+    assert capsys.readouterr().err == f"{name} is missing.\n"
+
+
 @pytest.fixture(scope="module")
 def named(tmp_path_factory):
     """A folder in which a scene and a capture have the name."""

@@ -129,6 +129,7 @@ def test_killed_between_two_files_and_resumed_it_ends_the_same(
     unfinished = tmp_path / ".report.json-0000.unfinished"
     unfinished.mkdir()
     (unfinished / "new.json").write_bytes(b"by a process that was killed")
+    os.utime(unfinished, (0, 0))
     refined = refine(few_photos, 2, truthful, out=tmp_path, resume=True)
     assert same(refined.splats, helped[0].splats)
     assert files_in(tmp_path).keys() == files_in(helped[1]).keys()

@@ -102,10 +102,22 @@ def test_slow_clients_hold_up_no_other_request(scene, many_files):
 def test_each_request_has_a_deadline(scene, monkeypatch, kind):
     for name in ("REQUEST_TIMEOUT_S", "ANSWER_TIMEOUT_S"):
         monkeypatch.setattr(live_server, name, 0.3)
+    monkeypatch.setattr(live_server, "SLOWEST_BYTES_PER_S", len(MODEL) / 0.3)
     with served(scene) as server:
+        accepted = []
+        finish = server.finish_request
+
+        def finish_request(request, address):
+            accepted.append(address)
+            finish(request, address)
+
+        monkeypatch.setattr(server, "finish_request", finish_request)
         slow = SlowClients(server, [kind])
         slow.step()
         end = time.monotonic() + 5.0
+        while not accepted:
+            assert time.monotonic() < end
+            time.sleep(0.01)
         while time.monotonic() < end:
             time.sleep(0.05)
             if not server._connections:
@@ -124,6 +136,19 @@ def test_only_the_first_bytes_of_a_long_request_are_received(scene):
         with contextlib.suppress(ConnectionError):
             client.recv(100)
         client.close()
+
+
+def test_a_large_answer_has_more_time(scene, monkeypatch):
+    monkeypatch.setattr(live_server, "ANSWER_TIMEOUT_S", 0.2)
+    with served(scene) as server:
+        client = socket.create_connection(("127.0.0.1", server.server_port))
+        client.sendall(SLOW["never read"][0].replace(b"TOKEN", server.token.encode()))
+        time.sleep(0.5)
+        received = 0
+        while piece := client.recv(1 << 20):
+            received += len(piece)
+        client.close()
+        assert received > len(MODEL)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="127.0.0.2 is an address of Linux only")

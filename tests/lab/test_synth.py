@@ -1,6 +1,7 @@
 """Synthetic captures: same seed, same bits; cameras, depths and masks agree."""
 
 import json
+import os
 import shutil
 import sys
 from pathlib import Path
@@ -148,6 +149,7 @@ def test_finished_scenes_are_kept_and_unfinished_ones_removed(lone):
     unfinished = lone / f".scene_{OTHER:05d}-0000.unfinished"
     (unfinished / "new/train").mkdir(parents=True)
     (unfinished / "new/train/099.png").write_bytes(b"half")
+    os.utime(unfinished, (0, 0))
     seen = []
     report = synthesize(
         lone, 2, first=OTHER, settings=SMALL, on_scene=lambda *row: seen.append(row)
@@ -180,17 +182,27 @@ def test_scenes_made_on_ray_are_the_same(made, tmp_path, monkeypatch):
     assert not scene(tmp_path, AROUND).exists()
 
 
-def test_two_processes_can_make_one_scene(tmp_path, monkeypatch):
+@pytest.mark.parametrize("moment", ["before", "while renaming"])
+def test_two_processes_can_make_one_scene(tmp_path, monkeypatch, moment):
     # Another process is the first to finish.
-    real = captures._photograph
+    real, rename = captures._photograph, os.rename
+    finished = scene(tmp_path, LONE)
 
     def overtaken(folder, *rest):
         document = real(folder, *rest)
-        shutil.copytree(folder, scene(tmp_path, LONE))
-        (scene(tmp_path, LONE) / "scene.json").write_text(json.dumps(document))
+        shutil.copytree(folder, finished)
+        (finished / "scene.json").write_text(json.dumps(document))
         return document
 
-    monkeypatch.setattr(captures, "_photograph", overtaken)
+    def overtaken_renaming(old, new):
+        if new == finished:
+            shutil.copytree(old, new)
+        rename(old, new)
+
+    if moment == "before":
+        monkeypatch.setattr(captures, "_photograph", overtaken)
+    else:
+        monkeypatch.setattr(os, "rename", overtaken_renaming)
     synthesize(tmp_path, 1, first=LONE, settings=SMALL)
     assert sorted(path.name for path in tmp_path.iterdir()) == [f"scene_{LONE:05d}"]
     assert len(load_capture(scene(tmp_path, LONE)).train_views) == 3

@@ -6,10 +6,11 @@ New content goes to a temporary name in the same folder, which is renamed when i
 from __future__ import annotations
 
 import contextlib
-import glob
 import os
+import re
 import shutil
 import tempfile
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,6 +19,9 @@ from igsr.errors import IgsrError
 
 #: Name of a folder in the temporary folder that replaces it.
 OLD = "old"
+
+#: Younger folders may be in use by another computer: network file systems may lock for one only.
+LEFT_AFTER_S = 3600.0
 
 
 @contextlib.contextmanager
@@ -38,11 +42,11 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         new = folder / f"new{target.suffix}"
         new.touch()
         yield new
-        if target.is_file() and not target.is_symlink():
-            shutil.copymode(target, new)
         with open(new, "rb") as written:
             # Without this, the file can be empty after a power failure.
             os.fsync(written.fileno())
+        if target.is_file() and not target.is_symlink():
+            shutil.copymode(target, new)
         os.replace(new, target)
 
 
@@ -73,16 +77,13 @@ def atomic_folder(path: str | os.PathLike[str], *, replace: bool = False) -> Ite
 def _unfinished(target: Path) -> Iterator[Path]:
     """Yield a private folder next to ``target``, which is removed at the end.
 
-    It is locked as long as this process lives, on systems that lock folders. Folders of killed
-    processes are removed. Rust's ``write_atomically`` uses the same names and locks.
+    It is locked as long as this process lives, on systems that lock folders. Old folders of
+    killed processes are removed. Rust's ``write_atomically`` uses the same names and locks.
     """
     prefix, suffix = f".{target.name}-", ".unfinished"
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        for left in target.parent.glob(f"{glob.escape(prefix)}*{suffix}"):
-            with _lock(left) as is_free:
-                if is_free:
-                    _remove(left, target)
+        _remove_leftovers(target)
         while True:
             folder = Path(tempfile.mkdtemp(suffix, prefix, target.parent))
             with _lock(folder) as is_free:
@@ -95,6 +96,19 @@ def _unfinished(target: Path) -> Iterator[Path]:
                     return
     except OSError as error:
         raise IgsrError(f"Cannot write {target}: {error.strerror or error}.") from error
+
+
+def _remove_leftovers(target: Path) -> None:
+    # A name with a further "-" belongs to a target with a longer name.
+    name = re.compile(rf"\.{re.escape(target.name)}-[^-]*\.unfinished")
+    oldest = time.time() - LEFT_AFTER_S
+    # Another writer may remove them, too; some folders can be written to but not listed.
+    with contextlib.suppress(OSError), os.scandir(target.parent) as entries:
+        for entry in entries:
+            if name.fullmatch(entry.name) and entry.stat(follow_symlinks=False).st_mtime < oldest:
+                with _lock(Path(entry.path)) as is_free:
+                    if is_free:
+                        _remove(Path(entry.path), target)
 
 
 def _remove(unfinished: Path, target: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
@@ -30,12 +31,15 @@ def unique_stems(names: Iterable[str], *suffixes: str) -> list[str]:
     Upper and lower case are the same to some file systems.
     """
     taken: set[str] = set()
+    tried: Counter[str] = Counter()
     stems: list[str] = []
     for name in names:
         path = relative_name(name)
         stem, longer = path.with_suffix("").as_posix(), path.as_posix()
         while not taken.isdisjoint(files := {(stem + end).casefold() for end in suffixes}):
-            stem, longer = longer, f"{longer}_"
+            tried[longer.casefold()] += 1
+            number = tried[longer.casefold()]
+            stem = longer if number == 1 else f"{longer}_{number}"
         taken |= files
         stems.append(stem)
     return stems

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+import re
 import signal
 import sys
 import threading
@@ -123,7 +124,7 @@ def _raise(number: int, frame: FrameType | None) -> None:
 
 def print_message(message: str) -> None:
     """Print an error, a warning or a note as one line on stderr, with a full stop at its end."""
-    message = printable(" ".join(message.split()))
+    message = printable(" ".join(re.split(r"[ \t\r\n]+", message.strip())))
     print(message if message.endswith((".", "!", "?")) else message + ".", file=sys.stderr)
 
 

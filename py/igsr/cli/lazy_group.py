@@ -75,7 +75,9 @@ class LazyGroup(TyperGroup):
         for before, word in pairwise(args):
             option, equals, value = word.partition("=")
             if not word or (option.startswith("-") and equals and not value):
-                named = option or (before if before.startswith("-") else "An argument")
+                # The option before may have no value.
+                after = f" after {before}" if before.startswith("-") else ""
+                named = option or f"An argument{after}"
                 raise IgsrError(f"{named} is empty; give a value, or leave it out")
         name, command, rest = super().resolve_command(ctx, args)
         if name is not None:

@@ -120,9 +120,21 @@ PhotosArgument = Annotated[
         metavar="PHOTOS", help="Photos or a video, with cameras or without.", show_default=False
     ),
 ]
+
+
+def _scene_file(scene: Path) -> Path:
+    if not scene.name:  # such as "." and "/"
+        raise IgsrError(f"{scene} is a folder; name a splat file.")
+    return scene
+
+
 SceneArgument = Annotated[
     Path,
-    typer.Argument(metavar="SCENE", help="Splat file: .ply, .splat, .ksplat, .spz, .sog or .glb."),
+    typer.Argument(
+        metavar="SCENE",
+        help="Splat file: .ply, .splat, .ksplat, .spz, .sog or .glb.",
+        callback=_scene_file,
+    ),
 ]
 
 

@@ -22,7 +22,7 @@ from igsr.capture import Capture, View, load_capture
 from igsr.capture.load import holds_cameras
 from igsr.capture.write_files import png_names
 from igsr.capture.write_transforms import write_cameras
-from igsr.cli.error_messages import INTERRUPTED, error_messages, print_message
+from igsr.cli.error_messages import error_messages, print_message
 from igsr.cli.web_view import has_display, serve_web_view
 from igsr.errors import IgsrError
 from igsr.rendering.run_folder import CAMERAS, VIEW
@@ -103,12 +103,7 @@ def view_command(
             readable = _cameras(cameras, Path(scenes[0]), Path(folder))
             if readable is not None:
                 words += ["--cameras", str(readable)]
-            try:
-                code = subprocess.run(
-                    words, check=False, env={**os.environ, **ENVIRONMENT}
-                ).returncode
-            except KeyboardInterrupt:
-                code = INTERRUPTED
+            code = subprocess.run(words, check=False, env={**os.environ, **ENVIRONMENT}).returncode
     raise typer.Exit(code if code >= 0 else 128 - code)
 
 

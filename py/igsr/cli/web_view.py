@@ -45,8 +45,8 @@ def serve_web_view(
         if not live_models(path):
             print_message(f"{path} has no model yet; the page shows it as soon as there is one.")
     with tempfile.TemporaryDirectory(prefix="igsr-view-") as folder:
-        cameras = readable_cameras(Path(folder))
-        with open_server(LiveView(paths, cameras), host, port) as server:
+        view = LiveView(paths, readable_cameras(Path(folder)))
+        with contextlib.closing(view), open_server(view, host, port) as server:
             _announce(server.url, server.server_port, is_open=not is_loopback(host))
             with contextlib.suppress(KeyboardInterrupt):
                 server.serve_forever()

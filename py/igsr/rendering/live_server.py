@@ -36,9 +36,11 @@ PORTS_TO_TRY = 20
 #: further one, an older one of its kind is closed.
 MAX_WITHOUT_TOKEN = 64
 MAX_WITH_TOKEN = 128
-#: Time to receive a whole request, and to send a whole answer: a large model, over a slow line.
+#: Time to receive a whole request, and to send a whole answer: more for a large one, such that
+#: lines of this rate are fast enough.
 REQUEST_TIMEOUT_S = 10.0
 ANSWER_TIMEOUT_S = 300.0
+SLOWEST_BYTES_PER_S = 1e5
 MAX_REQUEST_BYTES = 1 << 14
 #: Memory of the system for an answer that is being sent: several MB unless it is limited.
 SEND_BUFFER_BYTES = 1 << 18
@@ -168,7 +170,8 @@ class _Handler(BaseHTTPRequestHandler):
     def setup(self) -> None:
         """Receive the whole request: the base class limits single lines and pauses only."""
         super().setup()
-        self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
+        with contextlib.suppress(OSError):  # the client may have reset the connection
+            self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
         received = b""
         end = time.monotonic() + REQUEST_TIMEOUT_S
         while b"\r\n\r\n" not in received and len(received) < MAX_REQUEST_BYTES:
@@ -240,6 +243,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Referrer-Policy", "no-referrer")
         self.send_header("Cross-Origin-Resource-Policy", "same-origin")
         self.end_headers()
+        self.connection.settimeout(ANSWER_TIMEOUT_S + len(content) / SLOWEST_BYTES_PER_S)
         self.wfile.write(content)  # the timeout is for all of it
 
 

@@ -72,6 +72,10 @@ class LiveView:
         # Photos are decoded one at a time; each thread would keep memory for itself.
         self._decoder = ThreadPoolExecutor(max_workers=1)
 
+    def close(self) -> None:
+        """Drop the photos that are still to be decoded."""
+        self._decoder.shutdown(wait=False, cancel_futures=True)
+
     @property
     def title(self) -> str:
         """The page's title."""

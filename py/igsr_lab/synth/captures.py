@@ -198,12 +198,18 @@ def make_scene(folder: Path, seed: int, settings: CaptureSettings, index: int) -
     started = time.monotonic()
     final = folder / scene_name(index)
     # Another process may make the same scene, with the same bits, at the same time.
-    with atomic_folder(final, replace=True) as unfinished:
-        with one_threaded_mitsuba() as mitsuba:
-            document = _photograph(unfinished, seed, index, settings)
-            document["mitsuba"] = mitsuba.__version__
-        document["pyoidn"] = version("pyoidn")
-        _write_json(unfinished / "scene.json", document)
+    try:
+        with atomic_folder(final, replace=True) as unfinished:
+            with one_threaded_mitsuba() as mitsuba:
+                document = _photograph(unfinished, seed, index, settings)
+                document["mitsuba"] = mitsuba.__version__
+            document["pyoidn"] = version("pyoidn")
+            _write_json(unfinished / "scene.json", document)
+    except IgsrError:
+        finished = _finished(final, _recipe(seed, index, settings))
+        if finished is None:
+            raise
+        return finished
     row = {key: document[key] for key in ("family", "kind", "contents")}
     return {"name": final.name, **row, "seconds": round(time.monotonic() - started, 1)}
 

@@ -3,13 +3,16 @@
 use std::ffi::OsString;
 use std::fs::{self, DirBuilder, File};
 use std::hash::{BuildHasher, RandomState};
-use std::io::{BufWriter, Result as IoResult, Write};
+use std::io::{BufWriter, ErrorKind, Result as IoResult, Write};
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use crate::error::{Error, Result};
 
 /// End of the names of folders that hold unfinished files.
 const UNFINISHED: &[u8] = b".unfinished";
+/// Younger folders may be in use by another computer: network file systems may lock for one only.
+const LEFT_AFTER: Duration = Duration::from_secs(3600);
 
 /// Writes to a temporary file and renames it; on errors the old file stays. An old file's mode is kept.
 ///
@@ -63,7 +66,11 @@ impl Unfinished {
             let mut builder = DirBuilder::new();
             #[cfg(unix)]
             std::os::unix::fs::DirBuilderExt::mode(&mut builder, 0o700);
-            builder.create(&folder)?;
+            match builder.create(&folder) {
+                // Forked processes draw the same names.
+                Err(error) if error.kind() == ErrorKind::AlreadyExists => continue,
+                made => made?,
+            }
             let lock = File::open(&folder).ok().filter(|file| file.lock().is_ok());
             // Another writer may have removed it before it was locked.
             if folder.is_dir() {
@@ -79,15 +86,17 @@ impl Drop for Unfinished {
     }
 }
 
-/// Removes the unlocked folders of the file `path`.
+/// Removes the old, unlocked folders of the file `path`.
 fn remove_leftovers(path: &Path, prefix: &[u8]) {
     let parent = path.parent().filter(|parent| !parent.as_os_str().is_empty());
     for entry in fs::read_dir(parent.unwrap_or(Path::new("."))).into_iter().flatten().flatten() {
         let name = entry.file_name();
-        let name = name.as_encoded_bytes();
-        if name.starts_with(prefix)
-            && name.ends_with(UNFINISHED)
-            && entry.file_type().is_ok_and(|kind| kind.is_dir())
+        let random = name.as_encoded_bytes().strip_prefix(prefix);
+        // With a "-" it belongs to a file with a longer name.
+        if random.and_then(|end| end.strip_suffix(UNFINISHED)).is_some_and(|it| !it.contains(&b'-'))
+            && let Ok(data) = entry.metadata()
+            && data.is_dir()
+            && data.modified().is_ok_and(|time| time.elapsed().is_ok_and(|age| age > LEFT_AFTER))
             && let Ok(lock) = File::open(entry.path())
             && lock.try_lock().is_ok()
         {
