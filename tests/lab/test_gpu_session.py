@@ -107,7 +107,7 @@ def test_traffic_is_that_of_the_documentation():
     groups = {  # GB of docs/how-it-works/gpus.md
         ("project",): 2.18,
         ("sort_count", "sort_place"): 0.39,
-        ("tile_counts", "scan_apply", "emit", "ranges"): 0.37,
+        ("tile_counts", "scan_apply", "emit", "ranges"): 0.35,
         ("rasterize",): 0.33,
         ("loss_slopes", "loss_gradient"): 0.14,
         ("rasterize_backward", "rasterize_backward_sum"): 0.98,
