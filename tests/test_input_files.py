@@ -30,7 +30,7 @@ from igsr.cameras.cameras_file import read_cameras_file
 from igsr.cameras.da3.checkpoint import load_checkpoint as da3_checkpoint
 from igsr.cameras.dust3r.checkpoint import load_checkpoint as dust3r_checkpoint
 from igsr.cameras.networks import config_of
-from igsr.capture import colmap_files, memory_check
+from igsr.capture import colmap_files
 from igsr.capture.image_files import MAX_FREE_DEPTH, open_image, read_depth
 from igsr.capture.load import describe_capture, look_at
 from igsr.capture.point_cloud import read_point_cloud
@@ -82,7 +82,7 @@ READERS = {
 #: Files that igsr itself writes, or the system's, may be opened otherwise.
 OTHER_OPENERS = {
     *("_internal/input_files.py", "_internal/peak_memory.py", "_internal/atomic_write.py"),
-    *("capture/memory_check.py", "rendering/scene_page.py", "rendering/scene_model.py"),
+    *("_internal/available_memory.py", "rendering/scene_page.py", "rendering/scene_model.py"),
 }
 OPENING = re.compile(
     r"\.read_bytes\(|\.read_text\(|np\.load\(|np\.fromfile\(|\"rb\"\)|json\.load\("
@@ -259,7 +259,7 @@ def test_depth_is_no_larger_than_its_photo(tmp_path):
 
 def test_archives_of_arrays_are_no_larger_than_the_memory(tmp_path, monkeypatch):
     np.savez(tmp_path / "a.npz", settings=np.zeros(1 << 26, np.uint8))
-    monkeypatch.setattr(memory_check, "available_memory", lambda: 1 << 26)
+    monkeypatch.setattr(untrusted_npz, "available_memory", lambda: 1 << 26)
     for read in (load_checkpoint, read_cameras_file, load_splats):
         assert "bytes of memory are free" in refused(read, tmp_path / "a.npz")
     monkeypatch.undo()

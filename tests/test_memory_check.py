@@ -10,8 +10,10 @@ from pathlib import Path
 import pytest
 from capture_files import assert_refused, photo, save, write_transforms
 
+from igsr._internal import available_memory as available
+from igsr._internal.available_memory import available_memory
 from igsr.capture import load_capture, memory_check
-from igsr.capture.memory_check import USABLE_PART, PhotoSizes, available_memory
+from igsr.capture.memory_check import USABLE_PART, PhotoSizes
 from igsr.capture.photo_folder import read_photos
 from igsr.errors import IgsrError
 
@@ -97,8 +99,8 @@ def test_limits_of_control_groups(tmp_path, monkeypatch, version):
     group.mkdir(parents=True)
     own = tmp_path / "own"
     own.write_text("4:memory:/jobs/mine\n" if version == 1 else "0::/jobs/mine\n")
-    monkeypatch.setattr(memory_check, "_CGROUP_ROOT", root)
-    monkeypatch.setattr(memory_check, "_OWN_CGROUPS", own)
+    monkeypatch.setattr(available, "_CGROUP_ROOT", root)
+    monkeypatch.setattr(available, "_OWN_CGROUPS", own)
     without = available_memory()
     (group / limit).write_text("max\n")
     (group / used).write_text("100\n")

@@ -12,6 +12,7 @@ from typing import IO, Any
 import numpy as np
 import numpy.typing as npt
 
+from igsr._internal.available_memory import available_memory
 from igsr._internal.input_files import MAX_JSON_VALUES, open_file, parse_json
 
 #: Exceptions of zipfile, numpy and json for damaged files. RuntimeError: encrypted members, an
@@ -45,8 +46,6 @@ def stored_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
         OSError, ValueError, ...: ``DAMAGE``; the file is damaged, of another kind or larger than
             the available memory.
     """
-    from igsr.capture.memory_check import available_memory  # which imports this file
-
     with open_file(path) as file, zipfile.ZipFile(file) as archive:
         size, free = sum(member.file_size for member in archive.infolist()), available_memory()
         if size > free:

@@ -9,13 +9,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from igsr._internal.available_memory import available_memory
 from igsr._internal.choices import Backend
 from igsr.blocks.cells import Grid, centers_of
 from igsr.blocks.crops import Box
 from igsr.blocks.manifest import Manifest
 from igsr.blocks.visibility import splat_visibility, track_visibility, visible_boxes
 from igsr.capture.downscaling import reduced_size
-from igsr.capture.memory_check import LIBRARY_BYTES, USABLE_PART, available_memory
+from igsr.capture.memory_check import LIBRARY_BYTES, USABLE_PART
 from igsr.capture.photos import shot_sizes
 from igsr.capture.types import Points
 from igsr.splats import Splats

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from igsr._internal.available_memory import available_memory
 from igsr.cameras.da3.backbone import PATCH, NetworkConfig
 from igsr.cameras.da3.cameras import decode_pose
 from igsr.cameras.da3.network import Da3Network, ViewPrediction
@@ -22,7 +23,6 @@ from igsr.cameras.depth_maps import AlignedPhoto
 from igsr.cameras.grid import Grid, on_white
 from igsr.cameras.networks import float32_array, half_precision
 from igsr.capture import Camera
-from igsr.capture.memory_check import available_memory
 from igsr.capture.photo_folder import Photo
 from igsr.errors import IgsrError
 
