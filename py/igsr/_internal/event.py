@@ -1,4 +1,4 @@
-"""Events: what a run reports."""
+"""Events, which a run reports."""
 
 from __future__ import annotations
 

@@ -108,7 +108,7 @@ class RayCluster:
         spread: bool = False,
         retry: Callable[[T, Exception], T] | None = None,
     ) -> None:
-        """Do pieces of work in parallel; a failed piece does not stop the others.
+        """Do pieces of work in parallel; a failed piece does not stop the rest.
 
         Args:
             work: does one piece.
