@@ -80,8 +80,13 @@ def print_warning(text):
 def print_log(text):
     import logging
 
+    logger = logging.getLogger("igsr")
+    before = (logger.handlers[:], logger.level)
     log_to_stderr(1)
-    logging.getLogger("igsr").info("%s", text)
+    logger.info("%s", text)
+    # The handler writes to this test's stderr, which is closed for later tests.
+    logger.handlers[:] = before[0]
+    logger.setLevel(before[1])
 
 
 PRINTERS = {

@@ -193,10 +193,10 @@ def test_the_page_does_not_wait_for_cameras(large_capture, monkeypatch):
     read, reads = threading.Event(), []
     cameras_of = live_view.cameras_of
 
-    def slowly(file):
-        reads.append(file)
+    def slowly(*given):
+        reads.append(given)
         assert read.wait(60.0)
-        return cameras_of(file)
+        return cameras_of(*given)
 
     monkeypatch.setattr(live_view, "cameras_of", slowly)
     monkeypatch.setattr(live_view, "READING_WAIT_S", 0.05)
