@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import re
@@ -239,6 +240,13 @@ def test_arrays_in_the_order_of_fortran_are_read(tmp_path):
     np.save(tmp_path / "a.npy", np.asfortranarray(array))
     assert np.array_equal(untrusted_npz.stored_array(tmp_path / "a.npy", 12), array)
     assert np.array_equal(read_depth(tmp_path / "a.npy", 2.0, (4, 3)), 2 * array)
+
+
+def test_an_array_that_is_cut_while_it_is_read_is_damaged():
+    header = npy("{'descr': '|u1', 'fortran_order': False, 'shape': (100,)}")
+    # One byte would fill all hundred if it were broadcast.
+    with pytest.raises(ValueError, match="memoryview"):
+        untrusted_npz._read_array(io.BytesIO(header + b"\1"), len(header) + 100)
 
 
 def test_depth_is_no_larger_than_its_photo(tmp_path):

@@ -97,5 +97,6 @@ def _read_array(file: IO[bytes], size: int, most: int | None = None) -> npt.NDAr
         raise ValueError("it has an array of another size than its header says")
     data = np.empty(length, np.uint8)
     for begin in range(0, length, _PIECE):
-        data[begin : begin + _PIECE] = np.frombuffer(file.read(_PIECE), np.uint8)
+        # Unlike an array, a memoryview refuses a piece of another length.
+        memoryview(data)[begin : begin + _PIECE] = file.read(_PIECE)
     return data.view(dtype).reshape(shape, order="F" if fortran else "C")
