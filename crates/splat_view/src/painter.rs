@@ -93,7 +93,7 @@ impl Painter {
         self.blending.upload(&self.gpu, file)
     }
 
-    /// Records a frame; returns which stages have timestamps. Part of the work may be submitted at once.
+    /// Draws a frame; returns which stages have timestamps. Its last pass, compose, is recorded only.
     pub fn record(
         &mut self,
         encoder: &mut wgpu::CommandEncoder,

@@ -98,5 +98,5 @@ def _read_array(file: IO[bytes], size: int, most: int | None = None) -> npt.NDAr
     data = np.empty(length, np.uint8)
     for begin in range(0, length, _PIECE):
         # Unlike an array, a memoryview refuses a piece of another length.
-        memoryview(data)[begin : begin + _PIECE] = file.read(_PIECE)
+        data.data[begin : begin + _PIECE] = file.read(_PIECE)
     return data.view(dtype).reshape(shape, order="F" if fortran else "C")
