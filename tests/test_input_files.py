@@ -326,6 +326,21 @@ def test_photos_of_the_page_may_keep_coefficients_of_all_pixels(tmp_path):
     assert live_view._jpeg(tmp_path / "a.jpg").startswith(b"\xff\xd8")
 
 
+@pytest.mark.parametrize("kind", ["JPEG", "PNG", "WEBP", "AVIF", "HEIF", "BMP", "GIF", "TIFF"])
+def test_photos_of_the_page_take_no_more_memory_than_counted(tmp_path, kind):
+    pillow_heif.register_heif_opener()
+    path, fast = tmp_path / "a.png", {"compress_level": 1, "speed": 10, "method": 0, "quality": 1}
+    Image.new("RGB", (3000, 3000), (9, 99, 200)).save(path, kind, **fast)
+    path.write_bytes(path.read_bytes() + bytes(1000))  # for the limit on pixels per byte
+    with open_image(path) as photo:
+        assert photo.format == kind
+        photo.draft("RGB", (live_view.MAX_PHOTO_SIDE_PX,) * 2)
+        counted = live_view._bytes_to_decode(photo, 3000 * 3000)
+    _, peak = peak_of(lambda: live_view._jpeg(path))
+    smaller = 40_000_000  # the picture of the page
+    assert peak < counted + smaller, f"{peak} bytes"
+
+
 def test_the_page_keeps_no_large_reports(tmp_path):
     (tmp_path / "view").mkdir()
     for name in ("report.json", "view/run.json", "view/progress.json"):

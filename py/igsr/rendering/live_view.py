@@ -14,6 +14,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from PIL import Image
+
 from igsr._internal.input_files import MAX_JSON_VALUES
 from igsr.capture.image_files import load_pixels, open_image
 from igsr.errors import IgsrError
@@ -37,7 +39,8 @@ PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png")
 #: Maximum longest side of the photos that the page gets.
 MAX_PHOTO_SIDE_PX = 1600
 #: Maximum bytes of a photo while it is decoded: 4 per pixel, or 8 if it is converted. A progressive
-#: JPEG has 6 more per pixel of the file, also if it is decoded at a part of its size.
+#: JPEG has 6 more per pixel of the file, also if it is decoded at a part of its size. Decoders of
+#: formats that may have these names too, as AVIF and WebP, take up to 16.
 MAX_PHOTO_BYTES = 200_000_000
 #: Longest wait for cameras; thousands appear on the page later.
 READING_WAIT_S = 0.5
@@ -241,10 +244,7 @@ def _jpeg(path: Path) -> bytes:
         with open_image(path) as photo:
             width, height = photo.size
             photo.draft("RGB", size)
-            needed = (4 if photo.mode == "RGB" else 8) * photo.width * photo.height
-            if "progressive" in photo.info:
-                needed += 6 * width * height
-            if needed > MAX_PHOTO_BYTES:
+            if _bytes_to_decode(photo, width * height) > MAX_PHOTO_BYTES:
                 raise IgsrError(f"it has {width}x{height} pixels, too many for a page")
             load_pixels(photo, path)
             small = photo if photo.mode == "RGB" else photo.convert("RGB")
@@ -255,6 +255,14 @@ def _jpeg(path: Path) -> bytes:
     except Exception as error:
         raise IgsrError(f"{path} cannot be shown: {error}.") from error
     return file.getvalue()
+
+
+def _bytes_to_decode(photo: Image.Image, stored: int) -> int:
+    """Bytes that the decoding of a photo takes; ``stored`` is the pixels of its file."""
+    each = 4 if photo.mode == "RGB" else 8
+    if photo.format not in ("JPEG", "MPO", "PNG"):
+        each = 16
+    return each * photo.width * photo.height + 6 * stored * ("progressive" in photo.info)
 
 
 def _packed(model: LiveModel) -> bytes:
