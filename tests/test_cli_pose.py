@@ -123,7 +123,7 @@ def test_pose_writes_a_colmap_capture_and_a_plot(photos, calls, tmp_path, igsr_h
         (["{photos}", "--estimator", "colmap", "--graph", "swin-3"], ["graph", "colmap"]),
         (["{photos}", "--estimator", "magic"], ["magic", "colmap or dust3r or da3"]),
         (["{photos}", "--out", "{photos}/00.png"], ["it is a file"]),
-        (["{given}"], ["has cameras already", "--estimator"]),
+        (["{given}"], ["has cameras; fit it directly", "--estimator"]),
     ],
 )
 def test_wrong_arguments_of_pose(photos, given, calls, tmp_path, igsr_here, words, message):
@@ -214,7 +214,7 @@ def test_cameras_of_other_photos_or_settings_are_found_again(photos, calls, tmp_
     assert igsr_here(*fit).returncode == 0
     assert len(calls) == 3
     Image.new("RGB", (40, 40)).save(photos / "01.png")
-    assert_fails(igsr_here(*fit, "--resume"), "cameras of other photos")
+    assert_fails(igsr_here(*fit, "--resume"), "have changed since")
     assert igsr_here(*fit).returncode == 0
     assert len(calls) == 4
     assert read_cameras_file(damaged).photos["01.png"] == (photos / "01.png").stat().st_size
@@ -238,7 +238,9 @@ def test_a_run_with_few_placed_photos_stops_with_advice(photos, only, tmp_path, 
         stopped = igsr_here(*words)
         assert stopped.returncode == 1
         last = stopped.stderr.splitlines()[-1]
-        assert last.startswith("Only 2 of 6 photos could be placed, not 02.png, 03.png, 04.png, 05")
+        assert last.startswith(
+            "Only 2 of 6 photos could be placed; not placed: 02.png, 03.png, 04.png, 05"
+        )
         assert "--allow-missing" in last
         assert "dust3r" not in last, "its weights are missing"
         assert not (out / "scene.ply").exists()

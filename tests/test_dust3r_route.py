@@ -302,8 +302,8 @@ def test_invalid_input(scene):
         ({"predictor": scene.changed(doubt)}, 2, "no overlap between any two photos"),
         ({}, 1, "at least two photos"),
         ({"graph": "star"}, 4, "pair graph 'star' is unknown"),
-        ({"cameras": {"9.png": camera}}, 4, "cameras names '9.png', which is none of the photos"),
-        ({"cameras": {"0.png": small}}, 4, "of 24 x 48 pixels, and the photo has 48 x 48"),
+        ({"cameras": {"9.png": camera}}, 4, "cameras has '9.png', but no photo has this name"),
+        ({"cameras": {"0.png": small}}, 4, "has 24 x 48 pixels, but the photo has 48 x 48"),
         ({"predictor": None, "checkpoint": "/nowhere/at_all.pth"}, 4, "nowhere"),
     ):
         with pytest.raises(IgsrError, match=message):

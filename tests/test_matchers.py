@@ -122,7 +122,7 @@ def test_unknown_matchers_are_errors():
         Colmap(object())
     with pytest.raises(IgsrError, match=r"matcher must be auto, .* not 'surf'"):
         igsr.find_cameras(photos(2), "colmap", matcher="surf")
-    with pytest.raises(IgsrError, match="matcher is no option of dust3r"):
+    with pytest.raises(IgsrError, match="matcher is not an option of estimator dust3r"):
         igsr.find_cameras(photos(2), "dust3r", matcher=Known())
 
 

@@ -337,8 +337,12 @@ def test_auto_uses_the_cameras_of_a_capture(photos, registered, tmp_path):
 @pytest.mark.parametrize(
     ("estimator", "options", "message"),
     [
-        ("colmap", {"checkpoint": "weights.pth"}, "checkpoint is no option of colmap"),
-        ("auto", {"nonsense": 1}, "nonsense is no option of auto"),
+        (
+            "colmap",
+            {"checkpoint": "weights.pth"},
+            "checkpoint is not an option of estimator colmap",
+        ),
+        ("auto", {"nonsense": 1}, "nonsense is not an option of estimator auto"),
         ("magic", {}, "estimator must be auto, colmap or dust3r or da3, not 'magic'"),
         ("auto", {"seed": -1}, "seed is -1"),
     ],
@@ -352,7 +356,7 @@ def test_a_list_has_files_or_photos_of_different_names(photos, tmp_path):
     Image.fromarray(photos[0].image).save(tmp_path / "a.png")
     with pytest.raises(igsr.IgsrError, match="mixes files and Photo objects"):
         igsr.find_cameras([tmp_path / "a.png", photos[1]])
-    with pytest.raises(igsr.IgsrError, match="two photos of one name"):
+    with pytest.raises(igsr.IgsrError, match="two photos have the same name"):
         igsr.find_cameras([photos[1], photos[1]])
     with pytest.raises(igsr.IgsrError, match=r"there is only a\.png"):
         igsr.find_cameras([tmp_path / "a.png"])

@@ -67,7 +67,7 @@ def test_the_report_has_scores_and_times(helped):
     assert report["train"]["views"] == report["train"]["of"] == 3
     page = (out / "report.html").read_text()
     assert report["limit"]["sentence"] in page
-    assert f"Why it ended:</b> {refined.stop}." in page
+    assert f"Ended because:</b> {refined.stop}." in page
     assert "<h2>Round 2</h2>" in page
     # Three pictures of each test view and each added view.
     in_rounds = sum(len(done.selected) for done in refined.rounds)
@@ -251,7 +251,7 @@ def test_photos_that_are_not_placed_are_named(tmp_path, monkeypatch):
     assert report["photos"]["not_placed"] == list(first.not_placed)
     assert ", ".join(first.not_placed) in (out / "report.html").read_text()
     (photos / "0.png").unlink()
-    with pytest.raises(igsr.IgsrError, match="has the cameras of other photos than"):
+    with pytest.raises(igsr.IgsrError, match="have changed since"):
         igsr.refine(photos, 1, **given, resume=True)
 
 

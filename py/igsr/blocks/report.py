@@ -19,10 +19,10 @@ from igsr.evaluation.quick_scores import MAX_TRAIN_PHOTOS
 from igsr.evaluation.report_page import (
     ADDED,
     PHOTO,
-    beside,
     drawn_cameras,
     number,
     part_rows,
+    photos_and_renders,
     scene_frame,
     write_template,
 )
@@ -166,8 +166,8 @@ def write_block_page(
     views_label = f"{report['protocol']['views']} {'held out' if held_out else 'fitted'}"
     score_rows = [_score_row(views_label, report)]
     if across["photos"]:
-        text += ", across seams"
-        score_rows.append(_score_row(f"{across['photos']} of them across seams", across))
+        text += ", across borders"
+        score_rows.append(_score_row(f"{across['photos']} of them across borders", across))
     variables = {
         **report,
         "name": name,
@@ -175,8 +175,8 @@ def write_block_page(
         "scene": scene_frame([PageModel(name, splats)], cameras["train"], background, name),
         "score_rows": score_rows,
         "held_out": bool(test),
-        "beside_text": f"{text}.",
-        "beside_views": beside(views),
+        "pictures_text": f"{text}.",
+        "pictures": photos_and_renders(views),
         "cameras": drawn_cameras([(PHOTO, train), (ADDED, test)], train),
         "not_placed": [],
         "parts": part_rows(report["parts"], {}),

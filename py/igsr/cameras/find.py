@@ -75,7 +75,9 @@ class CameraSettings:
             raise IgsrError(f"estimator must be {AUTO}, {known}, not {self.estimator!r}")
         foreign = [name for name in self.options if name not in names]
         if foreign:
-            raise IgsrError(f"{foreign[0]} is no option of {self.estimator}; leave it out")
+            raise IgsrError(
+                f"{foreign[0]} is not an option of estimator {self.estimator}; remove it"
+            )
         _ = self.matchers  # raises if the name is unknown
 
     @property
@@ -173,8 +175,8 @@ def estimated_cameras(
     loaded, left_out = split_unfit(photos_of(photos, settings.frames, MAX_SIDE_PX))
     if len(loaded) < MIN_PHOTOS and left_out:
         raise IgsrError(
-            f"Cameras are found from at least {MIN_PHOTOS} photos, and {len(loaded)} is left of "
-            f"those given: {' '.join(left_out)} Add photos."
+            f"Cameras need at least {MIN_PHOTOS} photos, but only {len(loaded)} can be used: "
+            f"{' '.join(left_out)} Add photos."
         )
     found = estimate(loaded, settings, report)
     found.warnings = [*left_out, *found.warnings]
@@ -197,15 +199,15 @@ def estimate(photos: Sequence[Photo], settings: CameraSettings, report: Listener
         raise IgsrError(f"seed is {seed!r}; give a whole number of at least 0")
     if len(photos) < MIN_PHOTOS:
         only = f"; there is only {photos[0].name}" if photos else ""
-        raise IgsrError(f"Cameras are found from at least {MIN_PHOTOS} photos{only}; add photos")
+        raise IgsrError(f"Cameras need at least {MIN_PHOTOS} photos{only}; add photos")
     settings.check()
     name = settings.estimator
     panorama = next((photo.place.rig for photo in photos if photo.place is not None), None)
     if panorama is not None:
         if name not in (AUTO, "colmap"):
             raise IgsrError(
-                f"{panorama} is a panorama or wide fisheye photo, whose views {name} would place "
-                "one by one; use estimator colmap"
+                f"{panorama} is a panorama or wide fisheye photo, which estimator {name} does not "
+                "support; use estimator colmap"
             )
         name = "colmap"
 
@@ -241,9 +243,9 @@ def photos_of(photos: Source, frames: int = FRAMES, max_size: int | None = None)
     loaded = [photo for photo in photos if isinstance(photo, Photo)]
     files = [photo for photo in photos if not isinstance(photo, Photo)]
     if loaded and files:
-        raise IgsrError("photos mixes files and Photo objects; give one kind")
+        raise IgsrError("photos mixes files and Photo objects; use only one kind")
     if len({photo.name for photo in loaded}) < len(loaded):
-        raise IgsrError("photos holds two photos of one name; give each its own")
+        raise IgsrError("two photos have the same name; rename one")
     if loaded:
         return [reduced_photo(photo, max_size) for photo in loaded]
     return read_photos(files, frames, max_size)

@@ -103,8 +103,8 @@ class FoundCameras:
                 continue
             if photo.full_size != (camera.width, camera.height):
                 raise IgsrError(
-                    f"{photo.name} is {photo.full_size[0]}x{photo.full_size[1]} pixels and was "
-                    f"{camera.width}x{camera.height} when its camera was found; find cameras again"
+                    f"{photo.name} has {photo.full_size[0]}x{photo.full_size[1]} pixels, but its "
+                    f"camera was estimated for {camera.width}x{camera.height}; estimate it again"
                 )
             lens = self.estimate.lenses[index]
             view = _undistorted(photo, camera, lens, undistorters)

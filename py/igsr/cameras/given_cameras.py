@@ -18,10 +18,10 @@ def check_given_cameras(cameras: Mapping[str, Camera], photos: Sequence[Photo]) 
     sizes = {photo.name: photo.image.shape[:2] for photo in photos}
     for name, camera in cameras.items():
         if name not in sizes:
-            raise IgsrError(f"cameras names {name!r}, which is none of the photos")
+            raise IgsrError(f"cameras has {name!r}, but no photo has this name")
         if sizes[name] != (camera.height, camera.width):
             height, width = sizes[name]
             raise IgsrError(
-                f"the camera given for {name} is of {camera.width} x {camera.height} pixels, "
-                f"and the photo has {width} x {height}; scale its intrinsics"
+                f"the camera for {name} has {camera.width} x {camera.height} pixels, but the photo "
+                f"has {width} x {height}; scale the intrinsics"
             )

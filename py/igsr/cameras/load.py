@@ -82,9 +82,7 @@ def load_photos(
     seen = look_at(path, settings.frames, max_size)
     seen.train_photos(holdout)  # checks holdout
     if seen.has_cameras and (settings.options or settings.estimator != AUTO):
-        raise IgsrError(
-            f"{path} has cameras, or no photos; leave out the estimator and its options"
-        )
+        raise IgsrError(f"{path} has cameras or no photos; remove the estimator and its options")
     seen.check_memory(max_size, 0)
     kept = None if seen.has_cameras else _kept_cameras(path, run, settings)
     if announce is not None:
@@ -135,9 +133,9 @@ def check_enough_placed(found: FoundCameras, settings: CameraSettings) -> None:
     others = [name for name in networks if name != settings.estimator]
     advice = f", try estimator {' or '.join(others)}" if others else ""
     raise IgsrError(
-        f"Only {placed} of {count} photos could be placed, not {listed(found.not_placed)}: "
-        f"add photos between them that overlap more, leave out photos of another scene{advice}, or "
-        "continue with those that are placed (--allow-missing, allow_missing=True)."
+        f"Only {placed} of {count} photos could be placed; not placed: {listed(found.not_placed)}. "
+        f"Add photos between them that overlap more, remove photos of another scene{advice}, or "
+        "continue with the placed photos (--allow-missing, allow_missing=True)."
     )
 
 
@@ -156,8 +154,8 @@ def _kept_cameras(photos: Path, run: Run, settings: CameraSettings) -> KeptCamer
         kept = read_cameras_file(file)
         if kept.photos != file_sizes(photos):
             raise IgsrError(
-                f"{file} has the cameras of other photos than {photos} holds now; resume with the "
-                "same photos or leave resume out."
+                f"The photos in {photos} have changed since {file} was written; restore them, "
+                "or start over without resume."
             )
         return kept
     try:

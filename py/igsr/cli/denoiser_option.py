@@ -19,7 +19,7 @@ DenoiserOption = Annotated[
     option(
         "--denoiser",
         metavar="FILE|MODULE:FACTORY",
-        help="Weights (.safetensors), or a function that makes a denoiser.",
+        help="Weights (.safetensors), or a function that creates a denoiser.",
         panel=ADVANCED,
     ),
 ]

@@ -57,7 +57,7 @@ MaxSplatsOption = Annotated[
 ]
 PosesOption = Annotated[
     Literal["fixed", "joint"],
-    option("--poses", help="joint: optimize camera poses, too.", panel=FIT),
+    option("--poses", help="joint: also optimize camera poses.", panel=FIT),
 ]
 FocalOption = Annotated[
     Literal["fixed", "shared", "per-camera"],
@@ -88,7 +88,7 @@ BlocksOption = Annotated[
     option(
         "--blocks",
         metavar="auto|N",
-        help="Fit in N blocks, for scenes larger than memory.",
+        help="Split the scene into N blocks, for scenes larger than memory.",
         panel=ADVANCED,
     ),
 ]
@@ -131,7 +131,7 @@ def fit_command(
 ) -> None:
     """Fit splats to PHOTOS and score them.
 
-    Finds the cameras first if the photos have none.
+    Estimates the cameras first if the photos have none.
     """
     last_step = 0
 

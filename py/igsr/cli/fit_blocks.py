@@ -77,11 +77,11 @@ def fit_blocks(
     console.print(score_line(report))
     across, seams = report["across_seams"], report["seams"]
     if across["photos"]:
-        console.print(f"{across['photos']} of them across seams: PSNR {across['psnr']:.2f} dB")
+        console.print(f"{across['photos']} of them across borders: PSNR {across['psnr']:.2f} dB")
     if seams:
         console.print(
-            f"seams: {seams['photos']} photos across them have {seams['psnr_joined']:.2f} dB in "
-            f"the joined scene, {seams['psnr_alone']:.2f} dB in single blocks"
+            f"{seams['photos']} photos across borders: {seams['psnr_joined']:.2f} dB in the joined "
+            f"scene, {seams['psnr_alone']:.2f} dB in the block alone"
         )
     console.print(protocol_line(report["protocol"]), style="dim")
     console.print(parts_line(report["parts"]), style="dim")

@@ -35,10 +35,10 @@ def option(*names: str, help: str, metavar: str | None = None, panel: str | None
 
 
 BackendOption = Annotated[
-    RenderBackend, option("--backend", help="auto: a real GPU, else the CPU.")
+    RenderBackend, option("--backend", help="auto: the GPU if there is one, else the CPU.")
 ]
 FitBackendOption = Annotated[
-    FitBackend, option("--backend", help="auto: a real GPU, else the CPU.")
+    FitBackend, option("--backend", help="auto: the GPU if there is one, else the CPU.")
 ]
 BackgroundOption = Annotated[
     str | None,
@@ -72,9 +72,9 @@ ExposureOption = Annotated[
 ]
 ResumeOption = Annotated[bool, option("--resume", help="Continue the run in --out.")]
 SeedOption = Annotated[int, option("--seed", metavar="N", help="Random seed.", panel=ADVANCED)]
-JsonOption = Annotated[bool, option("--json", help="Print one JSON object.")]
+JsonOption = Annotated[bool, option("--json", help="Print the result as JSON.")]
 ExampleOption = Annotated[
-    bool, option("--example", help="Use the example photos that come with igsr.")
+    bool, option("--example", help="Use the example photos included in igsr.")
 ]
 EstimatorOption = Annotated[
     str,
@@ -94,7 +94,7 @@ MatcherOption = Annotated[
     option(
         "--matcher",
         metavar="NAME",
-        help="Matcher of photos: auto (both if installed), sift or aliked.",
+        help="Feature matcher: auto (both if installed), sift or aliked.",
         panel=CAMERAS,
     ),
 ]
@@ -117,7 +117,7 @@ CaptureArgument = Annotated[
 PhotosArgument = Annotated[
     Path | None,
     typer.Argument(
-        metavar="PHOTOS", help="Photos or a video, with cameras or without.", show_default=False
+        metavar="PHOTOS", help="Photos or a video, with or without cameras.", show_default=False
     ),
 ]
 

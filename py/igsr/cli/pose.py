@@ -64,8 +64,7 @@ def pose_command(
         given = photos[0] if len(photos) == 1 else photos
         if estimator == "auto" and isinstance(given, Path) and holds_cameras(given):
             raise IgsrError(
-                f"{given} has cameras already; fit it as it is, or name an --estimator to find "
-                "them again"
+                f"{given} has cameras; fit it directly, or give --estimator to estimate them again"
             )
         options = estimator_options(checkpoint, matcher) | (
             {} if graph is None else {"graph": graph}

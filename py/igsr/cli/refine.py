@@ -44,7 +44,9 @@ def refine_command(
     rounds: Annotated[
         str,
         option(
-            "--rounds", metavar="auto|N", help="Number of rounds; auto: 1, or 1 to 4 with alpha."
+            "--rounds",
+            metavar="auto|N",
+            help="Number of rounds; auto: 1, or 1 to 4 for photos with alpha.",
         ),
     ] = "auto",
     quality: QualityOption = "normal",
@@ -119,7 +121,7 @@ def _summary(refined: Refined, report: dict[str, Any], out: Path) -> dict[str, A
 
 
 def _tests(refined: Refined) -> list[dict[str, float | None]]:
-    """Scores of the test views after the first fit and after each round."""
+    """Scores of held-out photos after the first fit and after each round."""
     tests = [refined.first_test, *(done.test for done in refined.rounds)]
     return [test for test in tests if test]
 
@@ -129,7 +131,7 @@ def _print_summary(refined: Refined, report: dict[str, Any], out: Path) -> None:
     console.print(f"Rounds: {len(refined.rounds)}; stopped: {refined.stop}")
     by_round = " -> ".join(f"{test['psnr']:.2f}" for test in _tests(refined))
     if by_round:
-        console.print(f"PSNR of the test views by round: {by_round} dB")
+        console.print(f"PSNR of held-out photos by round: {by_round} dB")
     console.print(fitted_line(report["train"]))
     console.print(report["limit"]["sentence"])
     console.print(parts_line(report["parts"]), style="dim")

@@ -31,7 +31,7 @@ from igsr.rendering.scene_page import (
 )
 
 #: Longest side of pictures shown side by side.
-BESIDE = 480
+PICTURE_PX = 480
 SCENE_HEIGHT_PX = 560
 #: Kinds of cameras, which the page's script draws differently.
 PHOTO, ADDED, REJECTED = 0, 1, 2
@@ -53,16 +53,16 @@ def write_template(path: Path, templates: Path, name: str, variables: Mapping[st
         temporary.write_text(text, encoding="utf-8", errors="xmlcharrefreplace")
 
 
-def beside(views: Sequence[ScoredView]) -> list[dict[str, Any]]:
+def photos_and_renders(views: Sequence[ScoredView]) -> list[dict[str, Any]]:
     """Prepare photo, render and error of each view, scored by PSNR, for the template."""
     return [
         {
             "name": one.name,
             "psnr": one.scores["psnr"],
             "white": ERROR_WHITE,
-            "photo": jpeg(one.photo, BESIDE),
-            "render": jpeg(one.render, BESIDE),
-            "error": jpeg(error_picture(one), BESIDE),
+            "photo": jpeg(one.photo, PICTURE_PX),
+            "render": jpeg(one.render, PICTURE_PX),
+            "error": jpeg(error_picture(one), PICTURE_PX),
         }
         for one in views
     ]

@@ -11,14 +11,14 @@ import numpy as np
 from igsr.capture import Capture
 from igsr.evaluation.report_page import (
     ADDED,
-    BESIDE,
     PHOTO,
-    beside,
+    PICTURE_PX,
     drawn_cameras,
     fitted_cameras,
     jpeg,
     number,
     part_rows,
+    photos_and_renders,
     scene_frame,
     write_template,
 )
@@ -70,8 +70,8 @@ def write_fit_page(
         "placed_by": report["photos"]["placed_by"],
         "limit": report["limit"]["sentence"],
         "score_rows": _score_rows(report),
-        "beside_text": "Held-out photos." if held_out else "Fitted photos; none is held out.",
-        "beside_views": beside(shown),
+        "pictures_text": "Held-out photos." if held_out else "Fitted photos; none is held out.",
+        "pictures": photos_and_renders(shown),
         "cameras": drawn_cameras([(PHOTO, train), (ADDED, test)], train),
         "not_placed": report["photos"]["not_placed"],
         "parts": part_rows(report["parts"], PARTS),
@@ -101,7 +101,7 @@ def _masked_photos(masked: dict[str, float], capture: Capture) -> list[dict[str,
             hidden = ~view.mask
             picture[hidden] = (picture[hidden] // 2) + np.array(MASK_COLOR, np.uint8) // 2
         caption = f"{name}, {100.0 * masked[name]:.1f} %"
-        rows.append({"picture": jpeg(picture, BESIDE), "caption": caption})
+        rows.append({"picture": jpeg(picture, PICTURE_PX), "caption": caption})
     return rows
 
 

@@ -219,7 +219,9 @@ def _announce(
 ) -> None:
     """Print the plan of the fit, once the photos are counted."""
     if chosen.get("start") == "hull" and seen.channels < 4:
-        raise IgsrError(f"{seen.path} has photos without alpha; start hull needs it in all.")
+        raise IgsrError(
+            f"{seen.path} has photos without alpha; start hull needs alpha in all photos."
+        )
     if run.is_followed:
         for sentence in announcement(
             seen,

@@ -141,8 +141,8 @@ def _read_torch(path: Path) -> tuple[NetworkConfig, dict[str, Any]]:
         refused = re.search(r"(?:GLOBAL|class|function) ([\w.]+)", str(error))
         if "nsupported" in str(error) and refused:
             raise IgsrError(
-                f"{path} was not read, since it asks for {refused[1]}, which is more than tensors "
-                "and settings; use the published checkpoint"
+                f"{path} was not loaded, because it contains {refused[1]} and not only tensors and "
+                "settings; use the published checkpoint"
             ) from error
         raise IgsrError(damaged) from error
     stored = content.get("model") if isinstance(content, dict) else None

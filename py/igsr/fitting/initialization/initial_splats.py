@@ -85,7 +85,9 @@ def chosen_start(capture: Capture, start: str = "auto", wanted: int = DEFAULT_SP
             f"{capture.path} has fewer than {MIN_POINTS} points to start from; use another start."
         )
     if start == "hull" and not has_alpha:
-        raise IgsrError(f"{capture.path} has photos without alpha; start hull needs it in all.")
+        raise IgsrError(
+            f"{capture.path} has photos without alpha; start hull needs alpha in all photos."
+        )
     if start != "auto":
         return start
     if have_depths(views):
