@@ -35,10 +35,10 @@ def option(*names: str, help: str, metavar: str | None = None, panel: str | None
 
 
 BackendOption = Annotated[
-    RenderBackend, option("--backend", help="auto: the GPU if there is one, else the CPU.")
+    RenderBackend, option("--backend", help="auto: a hardware GPU if available, else the CPU.")
 ]
 FitBackendOption = Annotated[
-    FitBackend, option("--backend", help="auto: the GPU if there is one, else the CPU.")
+    FitBackend, option("--backend", help="auto: a hardware GPU if available, else the CPU.")
 ]
 BackgroundOption = Annotated[
     str | None,
