@@ -12,7 +12,8 @@ with Mitsuba 3 (``scalar_rgb``, which needs no driver). The capture is in the Ne
 in OpenGL axes, ``file_path`` without ``.png``) with 8-bit sRGB PNGs with straight alpha.
 
 The same seed gives the same files. Before any photo is taken, the cameras are checked: small lamps
-at known places are rendered through them and must appear where the written matrices project them.
+at known places are rendered through them and must appear at the projections of the written
+matrices.
 """
 
 from __future__ import annotations
@@ -102,7 +103,7 @@ def check_cameras(cameras: list[np.ndarray], tolerance: float = 0.05) -> float:
     lamps = TARGET + np.array([[0.8, 0, 0], [0, 0.7, 0.2], [-0.6, -0.5, 0], [0.1, 0.2, 0.6]])
     worst = camera_error([viewpoint(matrix) for matrix in cameras], lamps, radius=0.03)
     if worst > tolerance:
-        raise SystemExit(f"a lamp appears {worst:.2f} pixels from where its camera projects it")
+        raise SystemExit(f"a lamp appears {worst:.2f} pixels from its projection")
     return worst
 
 
@@ -400,7 +401,7 @@ def main() -> None:
 
     splits = {"train": train_cameras(np.random.default_rng(SEED)), "test": test_cameras()}
     off = check_cameras(splits["train"][:2] + splits["test"][:1])
-    print(f"cameras checked: lamps within {off:.3f} pixels of where they belong")
+    print(f"cameras checked: lamps within {off:.3f} pixels of their projections")
 
     jobs = []
     for split, cameras in splits.items():

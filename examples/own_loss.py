@@ -84,7 +84,7 @@ def main() -> None:
 
     fitted = {name: tensor.detach().numpy() for name, tensor in parameters.items()}
     splats = igsr.Splats(**fitted, origin=start.origin)
-    split = default_split(capture)  # test views, which the loop never saw, where there are any
+    split = default_split(capture)  # test views, if there are any: the loop never saw them
     scores = igsr.evaluate(splats, capture, split, background=(1.0, 1.0, 1.0))
     print(f"PSNR {scores['psnr']:.2f} dB on the {split} views")
 

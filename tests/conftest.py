@@ -13,10 +13,10 @@ from igsr.cameras.colmap import aliked
 from igsr.refinement import refine_photos, rounds
 from igsr_lab import __main__ as lab
 
-# Its numbers are megabytes that are not here: it is run where a folder of them is named.
+# Its numbers are megabytes that are not here: it runs only if a folder of them is given.
 collect_ignore = [] if os.environ.get("IGSR_DA3_FIXTURES") else ["test_da3_published.py"]
 
-# A failure must be the same failure on the next run, and a slow machine is no failure.
+# A failure must be the same failure on the next run, and slowness is not a failure.
 hypothesis.settings.register_profile("igsr", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("igsr")
 
@@ -32,7 +32,7 @@ def with_aliked(monkeypatch):
 
 
 def pytest_report_header() -> list[str]:
-    """Say what is left out, and how to have it."""
+    """List the tests that are left out, and how to run them."""
     return [f"{name}: left out, since IGSR_DA3_FIXTURES names no folder" for name in collect_ignore]
 
 

@@ -66,7 +66,7 @@ def prose(page: str) -> str:
 
 
 def inline_code(page: str) -> list[str]:
-    """What stands between single backquotes, line breaks as spaces."""
+    """Text between single backquotes, line breaks as spaces."""
     return [" ".join(span.split()) for span in re.findall(r"(?<!`)`([^`]+)`(?!`)", prose(page))]
 
 

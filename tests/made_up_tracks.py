@@ -1,4 +1,4 @@
-"""Tracks of made-up captures: where photos see points that are known exactly."""
+"""Tracks of made-up captures: exact image positions of known points."""
 
 from __future__ import annotations
 

@@ -65,7 +65,7 @@ class PointmapScene:
         return local.reshape(grid.height, grid.width, 3)
 
     def predictions(self, pairs=None, seed=0, spoil=None):
-        """Exact predictions, each at a scale of its own.
+        """Exact predictions, each with a different scale.
 
         Args:
             pairs: all by default.

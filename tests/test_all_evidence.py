@@ -53,7 +53,7 @@ def photos_of(cameras):
 
 
 def without_features(photos, index, image=128):
-    """The photos, of which one shows a plain gray or another image."""
+    """The photos; one shows a plain gray or another image."""
     blank = replace(photos[index], image=np.full_like(photos[index].image, image))
     return [*photos[:index], blank, *photos[index + 1 :]]
 
@@ -144,14 +144,14 @@ def test_a_photo_without_matches_keeps_its_prediction(truth, photos, monkeypatch
     assert rests_on(found) == ["features", "features", "network", "features", "features"]
     (warning,) = found.warnings
     assert warning.startswith(f"Cameras of {photos[2].name} are as The network predicts them, with")
-    # The others are accurate, and this one is as predicted relative to them.
+    # All other photos are accurate, and this one is as predicted relative to them.
     others = (0, 1, 3, 4)
     right = [found.cameras[i] for i in others]
     assert pose_errors(right, [truth[i] for i in others])["rotation"] < 0.6
     world = similarity_between([start[i].camera for i in others], right)
     wanted = world.camera(start[2].camera)
     assert pose_errors([*right, found.cameras[2]], [*right, wanted])["rotation"] < 0.5
-    # Its deviations come from the errors of the other predictions.
+    # Its deviations come from errors of other predictions.
     known, predicted_only = found.evidence[0], found.evidence[2]
     assert predicted_only.rotation > 10.0 * known.rotation
     assert 0.5 < predicted_only.rotation < 4.0

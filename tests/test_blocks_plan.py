@@ -1,4 +1,4 @@
-"""The plan of a fit in blocks: cells, their photos, and what photos show of them."""
+"""The plan of a fit in blocks: cells, their photos, and the visible parts of photos."""
 
 import multiprocessing
 import os
@@ -231,7 +231,7 @@ def test_scene_depths_are_those_of_the_splats():
 
 
 def test_hidden_splats_are_not_visible():
-    # Two walls, each hiding the other from a camera.
+    # Two walls that hide each other from a camera.
     grid = np.stack(np.meshgrid(np.linspace(-2, 2, 20), np.linspace(-2, 2, 20)), axis=-1)
     wall = np.concatenate([grid.reshape(-1, 2), np.full((400, 1), 3.0)], axis=1)
     splats = round_splats(np.concatenate([wall, wall + [0.0, 0.0, 3.0]]), size=0.2, opacity=6.0)

@@ -1,4 +1,4 @@
-"""Blocks over a real Ray cluster of three nodes, one of which is killed during the fit."""
+"""Blocks over a real Ray cluster of three nodes; one is killed during the fit."""
 
 import json
 import threading

@@ -47,7 +47,7 @@ def given(tmp_path):
 
 @pytest.fixture
 def only(monkeypatch):
-    """Replace COLMAP by a function that estimates cameras of photos; there is no network."""
+    """Replace COLMAP by a function that estimates cameras of photos without a network."""
 
     def replace(estimate):
         def estimator(photos, *, seed, progress):
@@ -107,7 +107,7 @@ def test_pose_writes_a_colmap_capture_and_a_plot(photos, calls, tmp_path, igsr_h
     np.testing.assert_allclose(capture.points.confidence, [1.0, 2.0, 3.0])
     with Image.open(out / "poses.png") as plot:
         colors = {color for _, color in plot.convert("RGB").getcolors(1 << 20)}
-    assert len(colors) > 50, "five cameras, each of its own color"
+    assert len(colors) > 50, "five cameras of different colors"
     again = igsr_here("pose", photos, "--out", tmp_path / "plain")
     assert "5 of 6 photos placed by auto" in again.stdout
     assert_fails(igsr_here("pose", photos, "--out", out), out, "is not empty")

@@ -67,7 +67,7 @@ def test_the_order_of_views_does_not_matter(network):
 
 
 def test_half_precision_is_close_and_predictions_are_float32(network):
-    # As on CUDA devices, where blocks run in half precision.
+    # As on CUDA devices: blocks run in half precision.
     views = list(hashed_pixels("half", 3, 42, 56))
     exact = network.predict(views, reference=0)
     with torch.autocast("cpu", dtype=torch.bfloat16):

@@ -118,7 +118,7 @@ def test_cameras_depths_and_points_of_one_pass(count, size):
     assert found.warnings == []
     xyz = similarity_between(found.cameras, cameras).apply(found.points.xyz.T)
     radius = np.linalg.norm(xyz, axis=0)
-    # All points lie on the one sphere or the other.
+    # All points lie on one of two spheres.
     assert np.minimum(np.abs(radius - 1.0), np.abs(radius - 9.0)).max() < 1e-3
     assert (radius < 1.01).mean() > 0.1
     for depth, trusted in zip(found.depths, found.trusted, strict=True):

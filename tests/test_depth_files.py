@@ -95,7 +95,7 @@ def test_depth_is_undistorted(tmp_path):
     view = load_capture(tmp_path).views[1]
     assert (view.depth[~view.mask] == 0.0).all()
     depth = view.depth[view.mask] - 1.0
-    # The colors have the same numbers and are interpolated; depth is that of the nearest pixel.
+    # The colors have the same numbers and are interpolated; depth is taken from the nearest pixel.
     assert np.abs(depth % 1000 - view.image[view.mask][:, 0]).max() <= 1.0
     assert np.abs(depth // 1000 - view.image[view.mask][:, 1]).max() <= 1.0
     assert len(np.unique(depth // 1000)) > WIDTH // 2

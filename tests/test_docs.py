@@ -49,15 +49,15 @@ NOT_RUN = {
 }
 #: Values in place of those on the page, so that runs are short.
 SHORT = {"--steps": "4", "--rounds": "0", "--orbit": "2", "--max-splats": "600"}
-#: Which of them are added where a command has them and the page does not name them.
+#: Options added to commands that have them, if the page does not name them.
 ADDED = ("--steps", "--rounds", "--max-splats")
-#: Where `igsr refine` makes a round, which takes longer than all else.
+#: The page on which `igsr refine` makes a round; this takes longer than all else.
 WITH_A_ROUND = "README.md"
 #: Options of ``igsr`` itself, before the command, and how many values follow each.
 PROCESS_OPTIONS = {"--threads": 1, "-v": 0, "-vv": 0, "--debug": 0, "--version": 0}
 #: Options in the text that are other programs'.
 OF_OTHERS = {"--locked", "--path", "--release", "--nocapture", "--grid", "--window"}
-#: Pages that tell of splat-view's options, and of options as they were.
+#: Pages that name options of splat-view, and former options.
 OTHER_OPTIONS = ("docs/guides/viewing.md", "CHANGELOG.md")
 #: Folders whose files name pages of docs/ in comments and messages.
 NAMING = ("py", "crates", "tests", "examples")
@@ -130,7 +130,7 @@ def _commands(block):
 
 
 def _without_process_options(words):
-    """The words without what stands between "igsr" and the command: "--threads 1", "-v" ..."""
+    """The words without options between "igsr" and the command: "--threads 1", "-v" ..."""
     rest = words[1:]
     while rest and rest[0] in PROCESS_OPTIONS:
         rest = rest[1 + PROCESS_OPTIONS[rest[0]] :]
@@ -164,7 +164,7 @@ def _unknown_options(words):
 
 
 def _parse(words):
-    """Fails where the command line does not take the words."""
+    """Fail if the command line rejects the words."""
 
     def below(command, name, rest, parent):
         context = command.make_context(name, rest, parent=parent)
@@ -178,7 +178,7 @@ def _parse(words):
 
 @pytest.mark.parametrize("page", [page for page in PAGES if page != "CHANGELOG.md"])
 def test_commands_and_options_exist(page):
-    """In blocks and in the text, also where they have placeholders."""
+    """In blocks and in the text, also with placeholders."""
     wrong = []
     code = [span.replace("python -m igsr_lab", "lab") for span in documentation.inline_code(page)]
     spans = [span for span in code if span.startswith(("igsr ", "lab "))]
@@ -282,7 +282,7 @@ def _shortened(words, place):
 
 @pytest.fixture(scope="session")
 def made(tmp_path_factory):
-    """What the pages name: ``photos`` without cameras, and ``examples`` with a tiny capture."""
+    """Files of the pages: ``photos`` without cameras, and ``examples`` with a tiny capture."""
     folder = tmp_path_factory.mktemp("docs")
     (folder / "photos").mkdir()
     for k, angle in enumerate(np.linspace(-0.4, 0.4, 5)):
@@ -305,7 +305,7 @@ def made(tmp_path_factory):
 
 @pytest.fixture
 def world(made, tmp_path, monkeypatch):
-    """A folder to run a page in, where fits are short."""
+    """A folder to run a page in, with short fits."""
     shutil.copytree(made, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     short = {"steps": int(SHORT["--steps"])}

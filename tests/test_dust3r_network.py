@@ -83,7 +83,7 @@ def test_parity_full_size():
 
 
 def key_lines(config):
-    """The keys and shapes of a published checkpoint, from those of the network."""
+    """The keys and shapes of a published checkpoint, from the keys of the network."""
     shapes = {key: tuple(t.shape) for key, t in empty_network(config).state_dict().items()}
     # Two kinds of keys that the network does not use.
     shapes["mask_token"] = (1, 1, config.decoder_dim)
@@ -94,7 +94,7 @@ def key_lines(config):
     return sorted(f"{key}\t{'x'.join(map(str, shape))}" for key, shape in shapes.items())
 
 
-# The checksums are those of the key lists of the published models.
+# Checksums of the key lists of the published models.
 @pytest.mark.parametrize(
     ("config", "keys", "checksum", "parameters"),
     [(DPT_512, 1009, 3494443566, 571_171_208), (LINEAR_224, 877, 1285370070, 532_342_784)],

@@ -52,7 +52,7 @@ class Scene:
             self.seen.append(seen)
 
     def predictor(self, photos, pairs, progress=None):
-        """Exact pointmaps of the photos by their names, each pair at a scale of its own."""
+        """Exact pointmaps of the photos by their names, each pair with a different scale."""
         index = [int(photo.name.removesuffix(".png")) for photo in photos]
         predictions = []
         for done, (first, second) in enumerate(pairs):

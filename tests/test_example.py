@@ -90,7 +90,7 @@ def test_size_and_splits_of_the_source(capture, example_path):
 
 
 def test_cameras_of_the_source_agree_with_its_photos(capture):
-    for view in capture.train_views[20:]:  # from above, where nothing occludes the marble
+    for view in capture.train_views[20:]:  # from above: nothing occludes the marble
         in_camera = view.camera.viewmat[:3, :3] @ MARBLE + view.camera.viewmat[:3, 3]
         projected = view.camera.K @ in_camera
         red, green, blue, alpha = np.moveaxis(view.image.astype(int), -1, 0)

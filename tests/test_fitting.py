@@ -319,7 +319,7 @@ def test_a_failure_of_the_last_checkpoint_keeps_the_splats(capture, tmp_path, mo
 
 
 def test_ctrl_c_during_the_last_save_saves_again(capture, tmp_path, monkeypatch):
-    # A mock calls what it wraps where its side effect is DEFAULT.
+    # A mock calls the wrapped function if its side effect is DEFAULT.
     once = Mock(wraps=save_checkpoint, side_effect=[KeyboardInterrupt, *[DEFAULT] * 9])
     monkeypatch.setattr(checkpoints, "save_checkpoint", once)
     path = tmp_path / "checkpoint.npz"

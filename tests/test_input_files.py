@@ -111,7 +111,7 @@ def in_time():
 
 
 def peak_of(work):
-    """The result of some work, and the bytes that it took at most; 0 if the system cannot tell."""
+    """The result of some work, and the peak of bytes that it took; 0 if the system cannot tell."""
     if not peak_memory.forget_peak():
         return work(), 0
     before = peak_memory.peak_bytes()
@@ -187,7 +187,7 @@ def png(width, height, depth=8, color=2):
         return struct.pack(">I", len(data)) + kind + data + checksum
 
     header = struct.pack(">IIBBBBB", width, height, depth, color, 0, 0, 0)
-    # As many bytes as a picture of zeros, which the limit on pixels per byte allows.
+    # The size of a picture of zeros, which the limit on pixels per byte allows.
     data = zlib.compress(bytes(1000)) + bytes(width * height // 500)
     return (
         b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")

@@ -25,7 +25,7 @@ def test_views_lie_near_known_ones_and_apart_and_look_at_the_ball():
     seen = list(known)
     for view in found:
         nearest = min(angle(view.camera, other) for other in seen)
-        # About what each camera looks at, which is near the ball's middle but not there.
+        # About a point that each camera looks at, near the ball's middle.
         assert nearest > 0.8 * MIN_STEP * STEP
         assert min(angle(view.camera, other) for other in known) < 1.3 * max(STEP, 17.2)
         towards = -view.camera.center / np.linalg.norm(view.camera.center)
@@ -86,7 +86,7 @@ def test_what_is_too_near_goes_by_how_far_a_view_itself_is():
 def test_no_view_stands_inside_or_behind_a_wall():
     known = [scenes.ring_camera(0.0)]
     free = novel_views(BALL, known, 8, "cpu")
-    # A wall that begins right of the photo's picture, where views to that side would stand.
+    # A wall that begins right of the photo's picture, in the way of views to that side.
     there = max((view.camera.center for view in free), key=lambda center: center[0])
     left = novel_views(with_wall(there * (1.0 - 0.5 * CLOSE)), known, 8, "cpu")
     assert any(np.allclose(view.camera.center, there) for view in free)

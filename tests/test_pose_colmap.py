@@ -241,7 +241,7 @@ OTHER_WORLD = Similarity(2.5, TURN, np.array([1.0, -2.0, 3.0]))
 
 
 class Known:
-    """An estimator that knows the cameras of some photos, in a world of its own."""
+    """An estimator that knows the cameras of some photos, in another world frame."""
 
     calls: ClassVar = []  # names and seeds of the estimators that were called
 

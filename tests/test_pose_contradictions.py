@@ -155,7 +155,7 @@ def test_two_rooms_that_look_alike_are_kept_apart(tmp_path, monkeypatch):
 
 
 def test_photos_of_another_season_stay_in_one_model(tmp_path, monkeypatch):
-    # They share few points with the others, but not in one place.
+    # They share few points with all other photos, in different places.
     cameras = [rooms.camera(angle) for angle in np.linspace(-0.4, 0.4, 6)]
     photos = rooms.photos(cameras[::2])
     original = rooms.texture

@@ -12,7 +12,7 @@ from igsr import rasterization
 
 
 def small_scene(count=6, **options):
-    """A scene for 8 x 5 pixels, each of which is a separate loss."""
+    """A scene for 8 x 5 pixels, each with a separate loss."""
     scene = torch_scene(count=count, **options)
     scene["Ks"][:, :2] = scene["Ks"][:, :2] / 3.0
     return scene

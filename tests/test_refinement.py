@@ -143,7 +143,7 @@ def test_without_a_selected_view_nothing_is_fitted_again(few_photos, helped, mon
 
 
 def test_pixels_behind_masks_get_no_weight(ball_photos):
-    """Photos of one half: novel views have no weight where only the other half would show."""
+    """Photos of one half: novel views have no weight in pixels that only show the hidden half."""
     half = np.zeros((40, 40), np.bool_)
     half[:, :20] = True
     masked = [replace(view, mask=half) for view in ball_photos.train_views]

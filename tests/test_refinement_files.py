@@ -1,4 +1,4 @@
-"""What a refinement writes, and that it can be resumed from there."""
+"""Files of a refinement, and resuming from them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What placed each photo, and pictures of the points that pairs of photos share."""
+"""Points that placed each photo, and pictures of points that pairs of photos share."""
 
 import numpy as np
 import scenes

@@ -1,4 +1,4 @@
-"""The wheel in an environment of its own: no Rust, no torch, no source of igsr beside it."""
+"""The wheel in a separate environment: no Rust, no torch, no source of igsr."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def wheel():
 
 
 class Clean:
-    """An environment with the wheel and what it requires, and a folder to run commands in."""
+    """An environment with the wheel and its requirements, and a folder to run commands in."""
 
     def __init__(self, folder: Path, wheel: Path) -> None:
         self.folder = folder
@@ -82,7 +82,7 @@ def clean(wheel, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def fitted(clean):
-    """What a short fit of the example printed."""
+    """Output of a short fit of the example."""
     words = ["fit", "--example", "--out", "out", "--steps", "60", "--backend", "cpu", "--json"]
     return json.loads(clean.run("igsr", *words).stdout)
 

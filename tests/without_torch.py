@@ -4,7 +4,7 @@ import os
 import subprocess
 import sys
 
-#: Packages of the extra ``refine``, and what comes with them.
+#: Packages of the extra ``refine``, and their dependencies.
 BLOCKED = ("torch", "torchmetrics", "torchvision")
 
 #: Python imports it when it starts, in child processes too.

@@ -299,7 +299,7 @@ def test_no_capture_is_in_both_sets(tmp_path):
     assert pair_files.capture_of_pairs("k.1-leave-one-out-3-seed0-cpu.npz") == "k.1"
     assert pair_files.capture_of_pairs("mine.npz") == "mine.npz"
 
-    # The name of one capture begins with that of another.
+    # The name of a capture begins with the name of another capture.
     names = ("a-noise-0", "a-p2-noise-0", "a-p2-sparse-0", "a-sparse-0", "a-sparse-1")
     files = zip(made_pairs(tmp_path / "all", count=5), names, strict=True)
     named = [path.rename(tmp_path / f"{name}-seed0-cpu.npz") for path, name in files]
