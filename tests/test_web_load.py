@@ -18,9 +18,8 @@ from igsr.capture.write_transforms import write_cameras
 from igsr.rendering import live_server, live_view, run_folder
 
 CLIENTS = 500
-SECONDS = 2.5
-#: The limit by hand is 1 s, on an idle computer.
-MOST_S = 3.0
+#: Seconds of load, and the longest answer. The short test shares its cores with others.
+LOADS = [(2.5, 3.0), pytest.param(30.0, 1.0, marks=pytest.mark.long)]
 MOST_MEMORY = 100e6
 MODEL = bytes(20_000_000)
 
@@ -77,12 +76,13 @@ class SlowClients:
         self.clients[number] = None
 
 
-def test_slow_clients_hold_up_no_other_request(scene, many_files):
+@pytest.mark.parametrize(("seconds", "most_s"), LOADS)
+def test_slow_clients_hold_up_no_other_request(scene, many_files, seconds, most_s):
     before = psutil.Process().memory_info().rss
     threads, longest = 0, 0.0
     with served(scene) as server:
         slow = SlowClients(server, CLIENTS // len(SLOW) * list(SLOW))
-        end = time.monotonic() + SECONDS
+        end = time.monotonic() + seconds
         while time.monotonic() < end:
             slow.step()
             for name in ("", "state", "surroundings"):
@@ -93,7 +93,7 @@ def test_slow_clients_hold_up_no_other_request(scene, many_files):
         memory = psutil.Process().memory_info().rss - before
         for number in range(len(slow.clients)):
             slow.close(number)
-    assert longest < MOST_S
+    assert longest < most_s
     assert threads < live_server.MAX_WITHOUT_TOKEN + live_server.MAX_WITH_TOKEN + 10
     assert memory < MOST_MEMORY
 

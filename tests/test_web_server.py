@@ -2,10 +2,12 @@
 
 import json
 import os
+import signal
 import socket
 import struct
 import time
 from concurrent.futures import ThreadPoolExecutor
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -299,6 +301,24 @@ def test_the_command_serves_until_ctrl_c(tmp_path, environment, scene, options, 
     assert len(lines) == len(notices), errors
     for line, notice in zip(lines, notices, strict=True):
         assert notice in line
+
+
+def test_sigterm_while_a_scene_is_read_is_one_sentence(tmp_path, environment):
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    scenes.splats(count=200_000).save(tmp_path / "scene.ply")
+    variables = {**environment, "TMPDIR": str(temporary)}
+    process = started_view(tmp_path, variables, "--web", "scene.ply")
+    address = urlsplit(process.stdout.readline().strip())
+    assert any(temporary.iterdir())
+    with socket.create_connection((address.hostname, address.port)) as connection:
+        connection.sendall(f"GET {address.path}model?id=scene HTTP/1.0\r\n\r\n".encode())
+        time.sleep(0.05)
+        process.send_signal(signal.SIGTERM)
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == 128 + signal.SIGTERM
+    assert errors == "Press Ctrl-C to stop.\nInterrupted.\n"
+    assert not any(temporary.iterdir())
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import webbrowser
 from collections.abc import Callable
 from pathlib import Path
 
-from igsr.cli.error_messages import print_message
+from igsr.cli.error_messages import Terminated, print_message
 from igsr.errors import IgsrError
 
 
@@ -48,8 +48,12 @@ def serve_web_view(
         view = LiveView(paths, readable_cameras(Path(folder)))
         with contextlib.closing(view), open_server(view, host, port) as server:
             _announce(server.url, server.server_port, is_open=not is_loopback(host))
-            with contextlib.suppress(KeyboardInterrupt):
+            try:
                 server.serve_forever()
+            except Terminated:
+                raise
+            except KeyboardInterrupt:
+                pass
 
 
 def _announce(url: str, port: int, *, is_open: bool) -> None:
