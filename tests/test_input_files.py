@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import io
 import json
 import os
@@ -20,6 +21,7 @@ import pillow_heif
 import pytest
 import scenes
 from capture_files import write_transforms
+from measured_process import measured
 from PIL import Image
 from web_views import served, with_token
 
@@ -111,7 +113,7 @@ def in_time():
 
 
 def peak_of(work):
-    """The result of some work, and the peak of bytes that it took; 0 if the system cannot tell."""
+    """The result of some work, and the bytes that it took at most; 0 if the system cannot tell."""
     if not peak_memory.forget_peak():
         return work(), 0
     before = peak_memory.peak_bytes()
@@ -187,7 +189,7 @@ def png(width, height, depth=8, color=2):
         return struct.pack(">I", len(data)) + kind + data + checksum
 
     header = struct.pack(">IIBBBBB", width, height, depth, color, 0, 0, 0)
-    # The size of a picture of zeros, which the limit on pixels per byte allows.
+    # The limit on pixels per byte allows a picture of zeros with these bytes.
     data = zlib.compress(bytes(1000)) + bytes(width * height // 500)
     return (
         b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
@@ -387,3 +389,257 @@ def test_a_full_device_is_one_sentence(words):
             [sys.executable, "-m", "igsr.cli", *words.split()], stdout=full, stderr=subprocess.PIPE
         )
     assert (result.returncode, result.stderr) == (1, b"No space left on device.\n")
+
+
+IGSR = (sys.executable, "-m", "igsr.cli")
+#: Shows the photo with a number, given as FOLDER?NUMBER, on the page of a live view.
+SHOW = """
+import sys
+from pathlib import Path
+from igsr.cli.error_messages import error_messages
+from web_views import served, with_token
+folder, _, number = sys.argv[1].partition("?")
+with error_messages(), served(Path(folder)) as server:
+    status, content = with_token(server, "photo?number=" + (number or "0"))
+sys.exit(None if status == 200 else content.decode())
+"""
+DRAW = ("-m", "igsr.rendering.window", "--backend", "cpu", "--size")
+#: Commands by the names below; an input and a free place are filled in.
+COMMANDS = {
+    "info": (*IGSR, "info", "{input}"),
+    "load": (*IGSR, "convert", "{input}", "{out}"),
+    "page": (*IGSR, "convert", "{input}", "{out}.html"),
+    "show": (sys.executable, "-c", SHOW, "{input}"),
+    "draw": (sys.executable, *DRAW, "{size}", "--screenshot", "{out}.png", "{input}"),
+    "resume": (*IGSR, "fit", "{capture}", "--resume", "--out", "{input}"),
+    "denoise": (*IGSR, "denoise", "{scene}", "--capture", "{capture}", "--out", "{out}")
+    + ("--denoiser", "{input}"),
+}
+#: Bytes of addresses for each command. torch takes most of them for itself.
+ADDRESSES = {**dict.fromkeys(COMMANDS, 2 << 30), "denoise": 16 << 30}
+
+
+def shown(folder, content, photo="in.png"):
+    """A folder of cameras whose photo has this content."""
+    made = scenes.capture(views=1, size=8).views[0]
+    (folder / photo).write_bytes(content)
+    write_cameras(folder / "cameras.json", [igsr.View(photo, made.camera, "train", made.image)])
+    return folder
+
+
+def capture(folder, **fields):
+    write_transforms(folder, **fields)
+    return folder
+
+
+def depths(folder, name, content, size=None):
+    (folder / name).write_bytes(content)
+    if size is not None:
+        os.truncate(folder / name, size)  # takes no disk
+    return capture(folder, frame={"depth_file_path": name})
+
+
+def pipe(path):
+    os.mkfifo(path)
+    return path
+
+
+def report(folder, make):
+    """A scene and its report, which ``make`` writes."""
+    scenes.splats().save(folder / "scene.ply")
+    make(folder / "report.json")
+    return folder / "scene.ply"
+
+
+def zeros(path):
+    path.symlink_to("/dev/zero")
+
+
+def exr(folder):
+    """An EXR of a hundred channels of 2000 x 2000 numbers, without its data."""
+
+    def attribute(name, kind, value):
+        return f"{name}\0{kind}\0".encode() + struct.pack("<i", len(value)) + value
+
+    names = sorted(["Z", *(f"c{number}" for number in range(99))])
+    channels = b"".join(n.encode() + b"\0" + struct.pack("<iiii", 2, 0, 1, 1) for n in names)
+    window = struct.pack("<iiii", 0, 0, 1999, 1999)
+    content = b"\x76\x2f\x31\x01" + struct.pack("<i", 2)
+    content += attribute("channels", "chlist", channels + b"\0")
+    content += attribute("compression", "compression", b"\0")
+    content += attribute("dataWindow", "box2i", window)
+    content += attribute("displayWindow", "box2i", window)
+    content += attribute("lineOrder", "lineOrder", b"\0")
+    content += attribute("pixelAspectRatio", "float", struct.pack("<f", 1.0))
+    content += attribute("screenWindowCenter", "v2f", struct.pack("<ff", 0.0, 0.0))
+    content += attribute("screenWindowWidth", "float", struct.pack("<f", 1.0)) + b"\0"
+    return depths(folder, "depth.exr", content, 2 << 30)
+
+
+def spellings(folder):
+    """A glTF that names a file of 20 MB by 60 spellings."""
+    (folder / "aaaaaa.bin").write_bytes(bytes(20 << 20))
+    names = ("".join(("a", "%61")[k >> bit & 1] for bit in range(6)) for k in range(60))
+    buffers = [{"byteLength": 20 << 20, "uri": f"{name}.bin"} for name in names]
+    document = {"asset": {"version": "2.0"}, "buffers": buffers}
+    (folder / "a.gltf").write_text(json.dumps(document))
+    return folder / "a.gltf"
+
+
+def levels(folder):
+    (folder / "lod-meta.json").write_text('{"a": [' + '{"":0},' * 8_500_000 + "{}]}")
+    return folder
+
+
+def scene(folder):
+    scenes.splats().save(folder / "scene.ply")
+    return folder / "scene.ply"
+
+
+def progressive(folder):
+    file = io.BytesIO()
+    Image.new("RGB", (5600, 5600)).save(file, "JPEG", progressive=True, subsampling=0)
+    return shown(folder, file.getvalue(), "in.jpg")
+
+
+def vast(kind):
+    """A photo of one color whose header claims 12000 x 10000 pixels; its data has 64 x 64."""
+    pillow_heif.register_heif_opener()
+    file = io.BytesIO()
+    Image.new("RGB", (64, 64)).save(file, kind)
+    size = struct.pack(">II", 64, 64)
+    assert size in file.getvalue()
+    return file.getvalue().replace(size, struct.pack(">II", 12000, 10000)) + bytes(20_000)
+
+
+def vast_photo(folder, content):
+    write_transforms(folder, w=12000, h=10000)
+    for photo in (folder / "images").iterdir():
+        photo.write_bytes(content)
+    return folder
+
+
+def small_photo():
+    file = io.BytesIO()
+    Image.new("RGB", (8, 8)).save(file, "PNG")
+    return file.getvalue()
+
+
+BROKEN_EXIF = b"Exif\0\0II*\0" + struct.pack("<IHHHII", 8, 3, 0x010F, 2, 5000, 90000)
+
+
+@pytest.mark.parametrize(
+    "words", [("info",), ("pose", "--out", "out"), ("fit", "--out", "out", "--backend", "cpu")]
+)
+def test_warnings_of_pillow_are_not_printed(tmp_path, words):
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    Image.new("RGB", (64, 64)).save(photos / "0.jpg", exif=BROKEN_EXIF)
+    (photos / "a.png").write_bytes(png(9500, 9500))
+    with pytest.warns(UserWarning, match="Corrupt EXIF"):
+        Image.open(photos / "0.jpg").getexif()
+    with pytest.warns(Image.DecompressionBombWarning):
+        Image.open(photos / "a.png")
+    command = [*IGSR, words[0], photos, *words[1:]]
+    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert ended.returncode in (0, 1)
+    printed = ended.stdout + ended.stderr
+    assert printed
+    assert not re.search(r"Warning|warn\(|EXIF|exceeds limit|Traceback|Truncated", printed), printed
+
+
+def colmap(folder, width="8", name="a.png"):
+    (folder / "sparse").mkdir()
+    (folder / "a.png").write_bytes(png(8, 8))
+    (folder / "sparse/cameras.txt").write_text(f"1 PINHOLE {width} 8 8 8 4 4\n")
+    (folder / "sparse/images.txt").write_text(f"1 1 0 0 0 0 0 0 1 {name.format(folder)}\n\n")
+    return folder
+
+
+def checkpoint(folder, header):
+    with zipfile.ZipFile(folder / "checkpoint.npz", "w") as archive:
+        archive.writestr("settings.npy", header)
+    return folder
+
+
+SIGNS = BROKEN_ARRAYS["signs"]
+#: Hostile inputs: the command, and a function that makes its input in a folder.
+HOSTILE = {
+    "a scene that is a pipe": ("info", lambda folder: pipe(folder / "a.ply")),
+    "points that are a pipe": (
+        "info",
+        lambda folder: capture(folder, ply_file_path=pipe(folder / "a.ply").name),
+    ),
+    "points without end": ("info", lambda folder: capture(folder, ply_file_path="/dev/zero")),
+    "report that is a pipe": ("page", lambda folder: report(folder, pipe)),
+    "report without end": ("page", lambda folder: report(folder, zeros)),
+    "vast depth": ("load", lambda folder: depths(folder, "d.png", png(9000, 9000, 16, 0))),
+    "sparse depth": (
+        "load",
+        lambda folder: depths(folder, "d.npy", npy(HEADER.format((50000, 40000))), 8 * 10**9 + 128),
+    ),
+    "depth of many channels": ("load", exr),
+    "vast PNG": ("load", lambda folder: vast_photo(folder, png(12000, 10000))),
+    "vast AVIF": ("load", lambda folder: vast_photo(folder, vast("AVIF"))),
+    "vast HEIC": ("load", lambda folder: vast_photo(folder, vast("HEIF"))),
+    "vast PNG on the page": ("show", lambda folder: shown(folder, png(13000, 13000))),
+    "vast AVIF on the page": ("show", lambda folder: shown(folder, vast("AVIF"))),
+    "progressive JPEG on the page": ("show", progressive),
+    "photo number": ("show", lambda folder: f"{shown(folder, png(8, 8))}?{'9' * 5000}"),
+    "one file by many spellings": ("info", spellings),
+    "index of empty objects": ("draw", levels),
+    "vast picture": ("draw", scene),
+    "checkpoint of signs": ("resume", lambda folder: checkpoint(folder, SIGNS)),
+    "width of many digits": ("load", lambda folder: colmap(folder, "9" * 4000)),
+    "absolute name": ("load", lambda folder: colmap(folder, name="/dev/zero")),
+    "weights that are a pipe": ("denoise", lambda folder: pipe(folder / "a.safetensors")),
+}
+#: These files may be missing; igsr goes on without them.
+OPTIONAL = ("report that is a pipe", "report without end")
+#: torch takes seconds to load.
+LONG = ("weights that are a pipe",)
+#: Small inputs of the commands.
+SMALL = {
+    **dict.fromkeys(("info", "page", "draw"), scene),
+    "load": capture,
+    "show": lambda folder: shown(folder, small_photo()),
+    "resume": lambda folder: checkpoint(folder, npy(HEADER.format((1,))) + bytes(4)),
+    "denoise": lambda folder: folder / "missing.safetensors",
+}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Runs a command on an input that is made for it."""
+    usual = tmp_path_factory.mktemp("usual")
+    scenes.write_capture(usual / "capture", scenes.capture(views=2, size=16))
+    given = {"scene": scene(usual), "capture": usual / "capture"}
+
+    @functools.cache
+    def run(command, make, size="16x16"):
+        folder = tmp_path_factory.mktemp("input")
+        out = tmp_path_factory.mktemp("out") / "out"
+        places = {**given, "input": make(folder), "out": out, "size": size}
+        words = (word if word == SHOW else word.format(**places) for word in COMMANDS[command])
+        return measured(words, ADDRESSES[command])
+
+    return run
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="address spaces are limited on Linux only")
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=pytest.mark.long if name in LONG else ()) for name in HOSTILE],
+)
+def test_hostile_inputs_take_little(run, monkeypatch, name):
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT / "py"), str(ROOT / "tests")]))
+    command, make = HOSTILE[name]
+    usual = run(command, SMALL[command])
+    hostile = run(command, make, "16384x16384" if name == "vast picture" else "16x16")
+    assert hostile.status == (0 if name in OPTIONAL else 1), hostile.errors
+    assert not re.search("Traceback|Warning|panicked", hostile.errors), hostile.errors
+    last = hostile.errors.splitlines()[-1]
+    assert last.endswith("."), last
+    assert len(last) < 500
+    assert hostile.seconds < usual.seconds + 2.0
+    assert hostile.peak < usual.peak + MEMORY
