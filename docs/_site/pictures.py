@@ -1,6 +1,6 @@
 """Make pictures of README and the guides from the example capture.
 
-    python docs/_site/pictures.py                       # all of them, in about 12 minutes
+    python docs/_site/pictures.py                       # all, in about 13 minutes on two cores
     python docs/_site/pictures.py floaters exposure     # these
 
 Needs a Chromium browser, and Xvfb and xdotool for the picture of the window.
