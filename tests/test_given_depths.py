@@ -224,7 +224,7 @@ def depths_left_out(capture):
 
 @pytest.mark.parametrize("factor", [0.6, 1.3, 2.0])
 def test_depths_that_other_photos_contradict_are_not_used(made, factor):
-    with pytest.warns(UserWarning, match=r"The depth of 2\.png contradicts that of the other"):
+    with pytest.warns(UserWarning, match=r"The depth of 2\.png contradicts the other"):
         assert depths_left_out(with_factors(made, {2: factor})) == [2]
 
 

@@ -34,6 +34,7 @@ PROGRAMS = Path(sys.executable).parent
 WHITE = (1.0, 1.0, 1.0)
 MAX_SPLATS = 20_000
 DISPLAY = ":97"
+OUTPUT = tempfile.TemporaryDirectory()
 #: Colors of blocks.
 TINTS = np.array([[214, 69, 65], [66, 133, 208], [80, 165, 90], [226, 160, 48]]) / 255
 
@@ -113,7 +114,7 @@ def forty() -> igsr.Splats:
 @functools.cache
 def example(command: str) -> Path:
     """The output folder of the command for the example."""
-    folder = Path(tempfile.mkdtemp())
+    folder = Path(OUTPUT.name) / command
     run(command, "--example", "--out", folder)
     return folder
 
@@ -163,11 +164,8 @@ def window(folder: Path) -> None:
     display = {**os.environ, "DISPLAY": DISPLAY}
     find = ["xdotool", "search", "--onlyvisible", "--name", "splat-view"]
     words = [PROGRAMS / "splat-view", example("fit"), "--camera", "3", "--size", "1280x800"]
-    with (
-        subprocess.Popen(["Xvfb", DISPLAY, "-screen", "0", "1280x800x24"]) as server,
-        subprocess.Popen(["sleep", "2"]) as started,
-    ):
-        started.wait()
+    with subprocess.Popen(["Xvfb", DISPLAY, "-screen", "0", "1280x800x24"]) as server:
+        time.sleep(2)  # it starts
         with subprocess.Popen(words, env=display) as viewer:
             while subprocess.run(find, env=display, stdout=subprocess.DEVNULL).returncode:
                 time.sleep(1)

@@ -128,7 +128,7 @@ def with_consistent_depths(views: Sequence[View]) -> list[View]:
     removed = {with_depths[int(i)] for i in np.nonzero(wrong)[0]}
     if removed:
         names = ", ".join(views[k].name for k in sorted(removed))
-        warn_user(f"The depth of {names} contradicts that of the other photos and is not used.")
+        warn_user(f"The depth of {names} contradicts the other photos and is not used.")
     return [
         replace(view, depth=None, depth_confidence=None) if k in removed else view
         for k, view in enumerate(views)
