@@ -111,10 +111,10 @@ def test_other_pictures_are_no_screenshots(photos):
 def test_a_folder_of_screenshots_is_an_error(tmp_path, photos):
     for index in range(4):
         Image.fromarray(screenshot("", index).image).save(tmp_path / f"{index}.png")
-    words = r"0 is left .*0\.png, 1\.png, 2\.png, 3\.png: .*screen"
+    words = r"only 0 can be used: 0\.png, 1\.png, 2\.png, 3\.png: .*screen"
     assert_refused(words, igsr.find_cameras, tmp_path)
     Image.fromarray(photos[0].image).save(tmp_path / "photo.png")
-    assert_refused("at least 2 photos, and 1 is left", igsr.find_cameras, tmp_path)
+    assert_refused("at least 2 photos, but only 1 can be used", igsr.find_cameras, tmp_path)
 
 
 def test_exif_of_a_screenshot(tmp_path, photos):
