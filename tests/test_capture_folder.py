@@ -6,6 +6,7 @@ import pytest
 from capture_files import assert_refused, photo, save, write_colmap, write_transforms
 
 from igsr.capture import load_capture
+from igsr.capture.load import look_at
 
 
 def test_transforms_come_before_a_colmap_model_and_may_be_named_as_a_file(tmp_path):
@@ -35,3 +36,8 @@ def test_no_cameras(tmp_path):
 def test_path_that_does_not_exist(tmp_path):
     for name in ("missing", "a\0b", "a" * 5000):
         assert_refused("does not exist", load_capture, tmp_path / name)
+        assert_refused("give a folder of photos, a video or a capture", look_at, tmp_path / name)
+
+
+def test_fits_ask_for_photos_if_a_folder_has_none(tmp_path):
+    assert_refused("holds no photos", look_at, tmp_path)

@@ -75,7 +75,10 @@ def describe_capture(path: Path, max_size: int | None = None) -> DescribedCaptur
     try:
         files = sorted(entry.name for entry in path.iterdir())
     except (OSError, ValueError) as error:
-        raise IgsrError(f"{path} does not exist or cannot be read; give a capture") from error
+        raise IgsrError(
+            f"{path} does not exist or cannot be read; give a folder with photos and cameras, or a "
+            "transforms.json"
+        ) from error
     describe = _reader(path)
     if describe is not None:
         return describe(max_size)
@@ -163,7 +166,13 @@ def look_at(
         IgsrError: nothing can be loaded from there.
     """
     path = Path(path)
-    if holds_cameras(path) or not has_photos(path):
+    if not os.path.exists(path):
+        raise IgsrError(
+            f"{path} does not exist or cannot be read; give a folder of photos, a video or a "
+            "capture"
+        )
+    # A folder without photos is refused by ``pixel_sizes``.
+    if holds_cameras(path) or not (path.is_dir() or has_photos(path)):
         shots = describe_capture(path, max_size).shots
         sizes = shot_sizes(shots, checked_headers(shots))
         train = sum(shot.split == "train" for shot in shots)

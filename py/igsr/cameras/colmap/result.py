@@ -50,7 +50,7 @@ def estimate_of(photos: Sequence[Photo], mapped: Mapped) -> Estimate:
         names = ", ".join(photos[index].name for index in group)
         sentences.append(
             f"{names} match each other, but not the registered photos: they may show another "
-            "place. Find their cameras in a run of their own."
+            "place. Find their cameras in a separate run."
         )
     if mapped.removed_pairs:
         advice = " Add photos between these and the registered ones." if missing else ""
