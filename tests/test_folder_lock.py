@@ -10,7 +10,7 @@ import pytest
 import scenes
 
 import igsr
-from igsr._internal.folder_lock import LOCK_FILE, folder_lock
+from igsr._internal.folder_lock import LOCK_FILE, folder_lock, try_lock
 from igsr.errors import IgsrError
 
 HOLD = """
@@ -53,6 +53,21 @@ def test_a_killed_process_holds_nothing(holder):
     igsr.fit(scenes.capture(), out=out, **OPTIONS)
     assert (out / "scene.ply").is_file()
     assert not (out / LOCK_FILE).exists()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no pipes in folders")
+def test_a_link_or_a_held_pipe_is_no_lock(tmp_path):
+    (tmp_path / "precious").write_text("kept")
+    (tmp_path / LOCK_FILE).symlink_to(tmp_path / "precious")
+    with folder_lock(tmp_path):
+        assert (tmp_path / "precious").read_text() == "kept"
+    (tmp_path / LOCK_FILE).unlink()
+    os.mkfifo(tmp_path / LOCK_FILE)
+    with open(tmp_path / LOCK_FILE, "r+b", buffering=0) as pipe:
+        assert try_lock(pipe.fileno())
+        signal.alarm(10)  # ends the test if it waits for the pipe
+        with folder_lock(tmp_path):
+            signal.alarm(0)
 
 
 def test_threads_take_turns(tmp_path):

@@ -15,6 +15,8 @@ from pathlib import Path
 from igsr.errors import IgsrError
 
 LOCK_FILE = ".igsr.lock"
+#: Not through a link, whose target would be overwritten; reading a pipe does not wait.
+_FLAGS = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
 #: The locked byte on Windows, which does not let other processes read locked bytes.
 _LOCKED_BYTE = 1 << 20
 
@@ -47,7 +49,7 @@ def folder_lock(folder: Path) -> Iterator[None]:
 def _locked(path: Path) -> int | None:
     """The open lock file; None if locks do not work there."""
     while True:
-        file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        file = os.open(path, _FLAGS, 0o666)
         try:
             is_free = try_lock(file)
             if is_free is None:
