@@ -486,6 +486,13 @@ def spellings(folder):
     return folder / "a.gltf"
 
 
+def properties(folder):
+    header = "".join(f"property uchar p{number}\n" for number in range(1_000_000))
+    content = f"ply\nformat ascii 1.0\nelement vertex 1\n{header}end_header\n"
+    (folder / "a.ply").write_text(content + "0 " * 1_000_000)
+    return capture(folder, ply_file_path="a.ply")
+
+
 def levels(folder):
     (folder / "lod-meta.json").write_text('{"a": [' + '{"":0},' * 8_500_000 + "{}]}")
     return folder
@@ -548,6 +555,7 @@ HOSTILE = {
         lambda folder: capture(folder, ply_file_path=pipe(folder / "a.ply").name),
     ),
     "points without end": ("info", lambda folder: capture(folder, ply_file_path="/dev/zero")),
+    "points of a million properties": ("info", properties),
     "report that is a pipe": ("page", lambda folder: report(folder, pipe)),
     "report without end": ("page", lambda folder: report(folder, zeros)),
     "vast depth": ("load", lambda folder: depths(folder, "d.png", png(9000, 9000, 16, 0))),

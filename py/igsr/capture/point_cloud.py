@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import io
+import re
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +21,7 @@ _TYPES = {
 }  # fmt: skip
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 _COLORS = ("red", "green", "blue")
+_MAX_HEADER_BYTES = 1 << 16
 
 
 def read_point_cloud(path: Path) -> Points | None:
@@ -41,13 +45,12 @@ def read_point_cloud(path: Path) -> Points | None:
         raise IgsrError(
             f"{path} is missing or cannot be read ({error.strerror}); put the point cloud there"
         ) from error
-    header, end, body = data.partition(b"end_header\n")
-    if not end:
-        header, end, body = data.partition(b"end_header\r\n")
+    end = re.search(rb"end_header\r?\n", data[:_MAX_HEADER_BYTES])
     damaged = IgsrError(f"{path} is no .ply of points or is damaged; export it again")
-    lines = header.decode("ascii", "replace").split("\n")
-    if not end or lines[0].strip() != "ply":
+    lines = data[: end.start()].decode("ascii", "replace").split("\n") if end else [""]
+    if end is None or lines[0].strip() != "ply":
         raise damaged
+    body = memoryview(data)[end.end() :]
     order, count, properties = "", -1, {}
     for line in lines[1:]:
         words = line.split()
@@ -74,11 +77,17 @@ def read_point_cloud(path: Path) -> Points | None:
     if len(body) < least:
         raise IgsrError(f"{path} is truncated: it announces {count} points; copy it again")
     if order == "ascii":
-        rows = body.decode("ascii", "replace").split("\n")[:count]
         try:
-            values = np.array([row.split()[: len(properties)] for row in rows], dtype=np.float64)
-            values = values.reshape(count, len(properties))
-        except ValueError as error:
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")  # of empty lines
+                values = np.loadtxt(
+                    io.BytesIO(body),
+                    usecols=range(len(properties)),
+                    max_rows=count,
+                    comments=None,
+                    ndmin=2,
+                ).reshape(count, len(properties))
+        except (ValueError, UserWarning) as error:
             raise damaged from error
         columns = dict(zip(properties, values.T, strict=True))
     else:
