@@ -34,6 +34,7 @@ from igsr.cameras.da3.checkpoint import load_checkpoint as da3_checkpoint
 from igsr.cameras.dust3r.checkpoint import load_checkpoint as dust3r_checkpoint
 from igsr.cameras.networks import config_of
 from igsr.capture import colmap_files
+from igsr.capture.exif import read_exif
 from igsr.capture.image_files import MAX_FREE_DEPTH, open_image, read_depth
 from igsr.capture.load import describe_capture, look_at
 from igsr.capture.point_cloud import read_point_cloud
@@ -204,6 +205,32 @@ def test_a_small_heic_claims_no_vast_picture(tmp_path):
     assert size in path.read_bytes()
     path.write_bytes(path.read_bytes().replace(size, vast))
     assert "claims 9000x9000 pixels" in refused(open_image, path)
+
+
+@pytest.mark.filterwarnings("ignore:fields overlap")
+@pytest.mark.parametrize("kind", ["PNG", "JPEG", "WEBP", "TIFF"])
+def test_fields_of_a_photo_do_not_share_their_bytes(tmp_path, kind):
+    count, size = 8000, 100_000
+    fields = b"".join(struct.pack("<HHII", 1000 + k, 7, size, 8) for k in range(count))
+    exif = (b"II*\0" + struct.pack("<IH", 8, count) + fields).ljust(size + 8, b"\0")
+    file, small = io.BytesIO(), Image.new("RGB", (8, 8))
+    if kind == "JPEG":
+        small.save(file, kind)
+        pieces = (b"Exif\0\0" + exif[at : at + 60_000] for at in (0, 60_000))
+        segments = (b"\xff\xe1" + struct.pack(">H", len(piece) + 2) + piece for piece in pieces)
+        content = file.getvalue()[:2] + b"".join(segments) + file.getvalue()[2:]
+    elif kind == "TIFF":
+        content = exif
+    else:
+        small.save(file, kind, exif=exif)
+        content = file.getvalue()
+    (tmp_path / "a.png").write_bytes(content)
+
+    def focal(path):
+        with open_image(path) as image:
+            return read_exif(image).focal
+
+    assert ("cannot be read" in refused(focal, tmp_path / "a.png")) == (kind == "TIFF")
 
 
 def npy(header):

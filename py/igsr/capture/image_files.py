@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import posixpath
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, cast
 
 import numpy as np
 import numpy.typing as npt
 from PIL import Image
+from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from igsr import _core
 from igsr._internal.input_files import open_file
@@ -40,6 +42,38 @@ _WHOLE_NUMBER_UNIT = 1e-3
 # Depths outside these limits count as unknown; products with them would overflow float32.
 _MIN_DEPTH = 1e-20
 _MAX_DEPTH = 1e20
+
+
+class _LimitedFile:
+    """A file from which at most twice its bytes are read.
+
+    Thousands of fields of EXIF or TIFF could otherwise copy the same bytes.
+    """
+
+    def __init__(self, file: IO[bytes]) -> None:
+        here = file.tell()
+        self._file, self._left = file, 2 * file.seek(0, os.SEEK_END)
+        file.seek(here)
+
+    def read(self, size: int) -> bytes:
+        self._left -= size
+        if self._left < 0:
+            raise OSError("fields overlap")
+        return self._file.read(size)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
+
+
+_load_directory = ImageFileDirectory_v2.load
+
+
+def _load_limited(directory: ImageFileDirectory_v2, file: IO[bytes]) -> None:
+    _load_directory(directory, cast(IO[bytes], _LimitedFile(file)))
+
+
+# Pillow reads the fields while it opens JPEG and TIFF, before they could be checked.
+ImageFileDirectory_v2.load = _load_limited  # type: ignore[assignment]
 
 
 def is_file(path: Path) -> bool:
