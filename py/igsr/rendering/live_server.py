@@ -18,6 +18,7 @@ import sys
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -161,6 +162,44 @@ class ViewServer(ThreadingHTTPServer):
             logger.exception("a request failed")
 
 
+def answer(
+    view: LiveView, name: str, query: dict[str, str], is_open: Callable[[], bool]
+) -> tuple[str, bytes, HTTPStatus]:
+    """Answer a request of the page.
+
+    Args:
+        view: what the page shows.
+        name: "" for the page, "state", "surroundings", "model" or "photo".
+        query: "id" of a model, "number" of a photo.
+        is_open: whether the client still waits.
+
+    Returns:
+        Content type, content and status.
+    """
+    try:
+        if name == "":
+            page = view.page().encode("utf-8", errors="xmlcharrefreplace")
+            return "text/html; charset=utf-8", page, HTTPStatus.OK
+        if name == "state":
+            state = json.dumps(view.state(), allow_nan=False).encode()
+            return "application/json", state, HTTPStatus.OK
+        if name == "surroundings":
+            return "application/json", view.surroundings(), HTTPStatus.OK
+        if name == "model":
+            return "application/octet-stream", view.model(query["id"], is_open), HTTPStatus.OK
+        if name == "photo" and query["number"].isdecimal():
+            return "image/jpeg", view.photo(int(query["number"]), is_open), HTTPStatus.OK
+        raise KeyError(name)
+    except IgsrError as error:
+        return _text(HTTPStatus.UNPROCESSABLE_ENTITY, str(error))
+    except (KeyError, ValueError):  # int() refuses thousands of digits
+        return _text(HTTPStatus.NOT_FOUND, "This address does not exist.")
+
+
+def _text(status: HTTPStatus, message: str) -> tuple[str, bytes, HTTPStatus]:
+    return "text/plain; charset=utf-8", message.encode("utf-8", errors="replace"), status
+
+
 class _Handler(BaseHTTPRequestHandler):
     """Answers one request, over HTTP/1.0: connections are not kept open."""
 
@@ -189,7 +228,7 @@ class _Handler(BaseHTTPRequestHandler):
         token, slash, name = path.removeprefix("/").partition("/")
         if not hmac.compare_digest(token.encode(), self.server.token.encode()):
             message = "This address has no token or an old one; use the one that igsr view printed."
-            self._answer_text(HTTPStatus.FORBIDDEN, message)
+            self._answer(*_text(HTTPStatus.FORBIDDEN, message))
             return
         self.server.accept_token(self.request)
         if not slash:
@@ -205,35 +244,13 @@ class _Handler(BaseHTTPRequestHandler):
         """Log nothing, since addresses contain the token."""
 
     def _answer_name(self, name: str, query: dict[str, str]) -> None:
-        view = self.server.view
-        try:
-            if name == "":
-                page = view.page().encode("utf-8", errors="xmlcharrefreplace")
-                self._answer("text/html; charset=utf-8", page)
-            elif name == "state":
-                state = json.dumps(view.state(), allow_nan=False).encode()
-                self._answer("application/json", state)
-            elif name == "surroundings":
-                self._answer("application/json", view.surroundings())
-            elif name == "model":
-                self._answer("application/octet-stream", view.model(query["id"], self._is_open))
-            elif name == "photo" and query["number"].isdecimal():
-                self._answer("image/jpeg", view.photo(int(query["number"]), self._is_open))
-            else:
-                raise KeyError(name)
-        except IgsrError as error:
-            self._answer_text(HTTPStatus.UNPROCESSABLE_ENTITY, str(error))
-        except (KeyError, ValueError):  # int() refuses thousands of digits
-            self._answer_text(HTTPStatus.NOT_FOUND, "This address does not exist.")
+        kind, content, status = answer(self.server.view, name, query, self._is_open)
+        self._answer(kind, content, status)
 
     def _is_open(self) -> bool:
         return self.server.is_open(self.request)
 
-    def _answer_text(self, status: HTTPStatus, message: str) -> None:
-        content = message.encode("utf-8", errors="replace")
-        self._answer("text/plain; charset=utf-8", content, status)
-
-    def _answer(self, kind: str, content: bytes, status: HTTPStatus = HTTPStatus.OK) -> None:
+    def _answer(self, kind: str, content: bytes, status: HTTPStatus) -> None:
         self.send_response(status)
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(content)))
