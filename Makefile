@@ -213,7 +213,7 @@ $(VENV)/.venv-ready: requirements-dev.txt
 
 $(VENV)/.build-ready: $(VENV)/.venv-ready pyproject.toml $(RUST_SOURCES)
 	@# Another environment that is active is not the one to install into.
-	env -u CONDA_PREFIX VIRTUAL_ENV="$(CURDIR)/$(VENV)" $(BIN)/maturin develop $(PROFILE) --locked --extras refine,matching
+	env -u CONDA_PREFIX VIRTUAL_ENV="$(CURDIR)/$(VENV)" $(BIN)/maturin develop $(PROFILE) --locked --extras refine,matching,app
 	@touch $@
 
 $(VENV)/.dev-ready: $(VENV)/.venv-ready requirements-dev.txt

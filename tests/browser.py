@@ -128,6 +128,20 @@ class Browser:
         """A key goes down, or up with ``kind`` "keyUp"."""
         self._ask("Input.dispatchKeyEvent", type=kind, key=key, code=code)
 
+    def wait_for(self, expression, timeout=60.0):
+        """Wait until JavaScript gives a true value, and return it."""
+        end = time.monotonic() + timeout
+        while not (value := self.run(expression)):
+            assert time.monotonic() < end, f"not true after {timeout} s: {expression}"
+            time.sleep(0.1)
+        return value
+
+    def choose_files(self, selector, paths):
+        """Give files to an input of the page."""
+        root = self._ask("DOM.getDocument", depth=0)["root"]["nodeId"]
+        found = self._ask("DOM.querySelector", nodeId=root, selector=selector)["nodeId"]
+        self._ask("DOM.setFileInputFiles", nodeId=found, files=[str(path) for path in paths])
+
     def screenshot(self, path):
         """Save a screenshot of the page as PNG."""
         path.write_bytes(base64.b64decode(self._ask("Page.captureScreenshot")["data"]))

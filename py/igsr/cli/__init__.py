@@ -43,6 +43,9 @@ class _Commands(LazyGroup):
             "info_command",
             "Describe a scene or a capture, and this machine's backends.",
         ),
+        "app": LazyCommand(
+            "igsr.cli.web_app", "app_command", "Open a page that makes scenes from dropped photos."
+        ),
         "view": LazyCommand(
             "igsr.cli.view",
             "view_command",

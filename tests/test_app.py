@@ -1,0 +1,328 @@
+"""``igsr app``: its page in a browser, bad photos, and requests that it must refuse."""
+
+import base64
+import errno
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+import zlib
+from pathlib import Path
+
+import apps
+import pytest
+from PIL import Image
+
+from igsr.app.intake import MAX_FILES
+from igsr.app.runs import DONE, QUEUED, STOPPED, Run, Runs
+from igsr.errors import IgsrError
+
+
+@pytest.fixture(scope="module")
+def app(tmp_path_factory):
+    """The folder of an app's runs, and its address."""
+    out = tmp_path_factory.mktemp("app") / "scenes"
+    with apps.served(str(out)) as address:
+        yield out, address
+
+
+@pytest.fixture(scope="module")
+def tab(tmp_path_factory):
+    with apps.Page(tmp_path_factory.mktemp("profile"), (900, 1400)) as page:
+        yield page
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory):
+    return apps.room_photos(tmp_path_factory.mktemp("photos"))
+
+
+def finished_run(out, name="20260101-120000-abcdef"):
+    """The folder of a run with a scene."""
+    folder = out / name
+    folder.mkdir()
+    (folder / "app.json").write_text(json.dumps({"name": name, "state": DONE, "photos": 3}))
+    (folder / "scene.ply").write_bytes(b"ply")
+    return folder
+
+
+def names_of(out):
+    return {path.name for path in out.iterdir() if not path.name.startswith(".")}
+
+
+def test_photos_make_a_run_that_tabs_share_stop_and_continue(app, tab, photos, tmp_path):
+    out, address = app
+    tab.open_app(address)
+    assert [url for url in tab.requests if not url.startswith((address, "data:", "blob:"))] == []
+    tab.drop(photos)
+    tab.wait_for_text("5 photos can be used.")
+    tab.wait_for("document.querySelectorAll('.grid-container img').length == 5")
+    name = tab.make()
+    assert {path.name for path in (out / name / "photos").iterdir()} == {p.name for p in photos}
+    tab.wait_for_text("find cameras")
+    tab.wait_for("document.querySelector('iframe').contentDocument.querySelector('canvas') != null")
+
+    with apps.Page(tmp_path / "second", (400, 800)) as second:
+        second.open_app(f"{address}?run={name}")
+        second.wait_for_text("Working.")
+        second.open_app(address)
+        second.press("Use the example photos")
+        waiting = second.opened_run()
+        assert waiting != name
+        second.wait_for_text("Waiting. Another scene is being made.")
+        second.press("Stop")
+        second.wait_for_text("Stopped. Not started.")
+
+        tab.leave()
+        tab.open_app(f"{address}?run={name}")
+        tab.wait_for_text("Working.")
+        tab.press("Stop")
+        tab.wait_for_text("Stopped. Stopped; it continues from its checkpoint.")
+        second.open_app(f"{address}?run={name}")
+        second.press("Continue")
+        second.wait_for_text("Working.")
+        tab.wait_for_text("Working.")
+        tab.press("Stop")
+        second.wait_for_text("Stopped.")
+
+    tab.open_app(address)
+    text = tab.wait_for_text("Scenes")
+    assert text.count("Stopped") == 2
+    assert tab.run("document.documentElement.scrollWidth <= innerWidth")
+
+
+def damaged(folder):
+    file = folder / "scan.jpg"
+    file.write_bytes(b"%PDF-1.7\n1 0 obj\n")
+    return [file]
+
+
+def huge(folder):
+    """A PNG of 200 megapixels, one color: 25 kB."""
+    width, height = 20000, 10000
+    rows = zlib.compressobj(9)
+    body = b"".join(rows.compress(b"\0" * (1 + width // 8)) for _ in range(height)) + rows.flush()
+
+    def chunk(kind, data):
+        check = zlib.crc32(kind + data).to_bytes(4, "big")
+        return len(data).to_bytes(4, "big") + kind + data + check
+
+    sizes = width.to_bytes(4, "big") + height.to_bytes(4, "big") + bytes([1, 0, 0, 0, 0])
+    file = folder / "huge.png"
+    file.write_bytes(
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", sizes) + chunk(b"IDAT", body) + chunk(b"IEND", b"")
+    )
+    return [file]
+
+
+def many(folder):
+    files = [folder / f"{number}.png" for number in range(500)]
+    Image.new("RGB", (8, 8)).save(files[0])
+    for file in files[1:]:
+        shutil.copyfile(files[0], file)
+    return files
+
+
+BAD = {
+    "no photo": (lambda folder: [], "No photo can be used"),
+    "one photo": (lambda folder: apps.room_photos(folder, 1), "Only one photo can be used"),
+    "a document": (damaged, "scan.jpg"),
+    "too many": (many, f"These are 500 files; choose at most {MAX_FILES}."),
+    "too large": (huge, "huge.png claims too many pixels for a photo"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_photos_are_a_sentence_and_start_nothing(app, tab, tmp_path, case):
+    out, address = app
+    before = names_of(out)
+    make_files, sentence = BAD[case]
+    tab.open_app(address)
+    files = make_files(tmp_path)
+    if files:
+        tab.drop(files)
+        tab.wait_for_text(sentence)
+    tab.press("Make the scene")
+    text = tab.wait_for_text(sentence)
+    assert "Traceback" not in text
+    assert names_of(out) == before
+
+
+def test_dark_and_blurred_photos_are_named(app, tab, tmp_path, photos):
+    files = [shutil.copy(photo, tmp_path / photo.name) for photo in photos]
+    Image.open(photos[0]).point(lambda level: level // 8).save(tmp_path / photos[0].name)
+    _, address = app
+    tab.open_app(address)
+    tab.drop(files)
+    assert f"{photos[0].name}: dark" in tab.wait_for_text("dark; add light")
+
+
+def test_a_run_is_deleted_only_if_that_is_confirmed(app, tab):
+    out, address = app
+    folder = finished_run(out)
+    tab.open_app(f"{address}?run={folder.name}")
+    tab.wait_for_text("Done.")
+    tab.run("window.confirm = () => { window.asked = true; return false; }")
+    tab.press("Delete")
+    tab.wait_for("window.asked")
+    time.sleep(1.0)
+    assert folder.exists()
+    tab.run("window.confirm = () => true")
+    tab.press("Delete")
+    tab.wait_for_text("A scene from photos")
+    assert not folder.exists()
+
+
+def test_programs_call_documented_names(app):
+    from gradio_client import Client
+    from gradio_client.exceptions import AppError
+
+    _, address = app
+    client = Client(address, verbose=False)
+    name = client.predict("draft", 0, False, 7, api_name="/make_example")
+    assert client.predict(name, api_name="/run_state")["state"] in ("queued", "running")
+    client.predict(name, api_name="/stop_run")
+    state = apps.until(
+        lambda: (found := client.predict(name, api_name="/run_state"))["state"] == STOPPED and found
+    )
+    assert state["files"] == {}
+    for unknown in ("../x", "", "20260101-120000-000000"):
+        with pytest.raises(AppError, match="This run does not exist"):
+            client.predict(unknown, api_name="/run_state")
+
+
+def test_a_full_disk_leaves_nothing(tmp_path, photos, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    runs = Runs(tmp_path / "scenes")
+    monkeypatch.setattr(shutil, "copyfile", full)
+    with pytest.raises(OSError, match="No space left"):
+        runs.create({"a.png": photos[0]})
+    assert runs.names() == []
+    assert names_of(runs.root) == set()
+    runs.close()
+
+
+def test_a_run_cannot_be_deleted_while_it_is_queued(tmp_path, photos):
+    runs = Runs(tmp_path)
+    runs._is_closed.set()  # nothing starts
+    runs._worker.join()
+    name = runs.create({"a.png": photos[0]}, Run("")).name
+    assert runs.get(name).state == QUEUED
+    with pytest.raises(IgsrError, match="stop it first"):
+        runs.delete(name)
+    runs.stop(name)
+    runs.delete(name)
+    assert names_of(tmp_path) == set()
+    again = Runs(tmp_path)
+    assert again.names() == []
+    again.close()
+
+
+def test_files_of_a_run_are_served_by_an_allow_list(app, tmp_path):
+    out, address = app
+    folder = finished_run(out)
+    secret = tmp_path / "secret.txt"
+    secret.write_text("hidden words")
+    (folder / "scene.html").symlink_to(secret)
+    (out / "20260101-120000-bbbbbb").symlink_to(tmp_path)
+    (folder / "report.html").mkdir()
+    assert apps.answered(address, f"/runs/{folder.name}/files/scene.ply") == (200, b"ply")
+    refused = [
+        f"/runs/{folder.name}/files/app.json",
+        f"/runs/{folder.name}/files/scene.html",
+        f"/runs/{folder.name}/files/report.html",
+        f"/runs/{folder.name}/files/scene.spz",  # its scene is damaged
+        f"/runs/{folder.name}/files/../app.json",
+        f"/runs/{folder.name}/files/..%2fapp.json",
+        f"/runs/{folder.name}/files/%2e%2e%2fapp.json",
+        f"/runs/{folder.name}/view/..%2f..%2fapp.json",
+        f"/runs/{folder.name}/view/photo?number=-1",
+        "/runs/20260101-120000-bbbbbb/files/secret.txt",
+        "/runs/../../etc/passwd",
+        "/runs/..%2f..%2f/files/scene.ply",
+        "/runs/%00/files/scene.ply",
+        f"/gradio_api/file={folder}/app.json",
+        "/gradio_api/file=/etc/passwd",
+        f"/gradio_api/file={out}/../secret.txt",
+    ]
+    for path in refused:
+        status, content = apps.answered(address, path)
+        assert status in (403, 404), path
+        assert b"hidden words" not in content
+        assert b"root:" not in content
+    shutil.rmtree(folder)
+    (out / "20260101-120000-bbbbbb").unlink()
+
+
+def test_names_of_uploads_stay_in_their_folder(app):
+    out, address = app
+    form = (
+        b'--x\r\nContent-Disposition: form-data; name="files"; filename="../../../evil.png"\r\n'
+        b"Content-Type: image/png\r\n\r\nx\r\n--x--\r\n"
+    )
+    kind = ("Content-Type", "multipart/form-data; boundary=x")
+    status, content = apps.answered(address, "/gradio_api/upload", "POST", form, [kind])
+    assert status == 200
+    assert Path(json.loads(content)[0]).is_relative_to(out / ".uploads")
+    assert not list(out.parent.rglob("../evil.png"))
+
+
+def test_requests_of_other_sites_and_host_names_are_refused(app):
+    _, address = app
+    port = address.rstrip("/").rpartition(":")[2]
+    assert apps.answered(address)[0] == 200
+    assert apps.answered(address, headers=[("Origin", address.rstrip("/"))])[0] == 200
+    for origin in ("http://evil.example", "null", f"http://127.0.0.1:{int(port) + 1}"):
+        status, _ = apps.answered(address, "/gradio_api/upload", "POST", b"", [("Origin", origin)])
+        assert status == 403, origin
+    for host in ("evil.example", f"evil.example:{port}", "127.0.0.1.evil.example", "[", "x"):
+        assert apps.answered(address, host=host)[0] == 403, host
+    assert apps.answered(address, host=f"localhost:{port}")[0] == 200
+
+
+def test_uploads_have_a_limit(app):
+    _, address = app
+    for length, status in (("99999999999", 413), ("9" * 400, 400), ("-1", 400), ("x", 400)):
+        headers = [("Content-Length", length)]
+        assert apps.answered(address, "/gradio_api/upload", "POST", headers=headers)[0] == status
+
+
+def test_a_password_guards_every_address(tmp_path):
+    folder = tmp_path / "scenes"
+    folder.mkdir()
+    run = finished_run(folder)
+    with apps.served(str(folder), variables={"IGSR_PASSWORD": "Väter"}) as address:
+
+        def status(user, password, path, **more):
+            login = base64.b64encode(f"{user}:{password}".encode()).decode()
+            return apps.answered(
+                address, path, headers=[("Authorization", f"Basic {login}")], **more
+            )[0]
+
+        paths = ("/", "/config", f"/runs/{run.name}/files/scene.ply", f"/runs/{run.name}/view/")
+        for path in paths:
+            assert apps.answered(address, path)[0] == 401
+            assert status("igsr", "Vater", path) == 401
+            assert status("root", "Väter", path) == 401
+            assert status("igsr", "Väter", path) == 200
+            assert status("igsr", "Väter", path, host="scenes.example") == 200
+
+
+def test_other_computers_need_a_password_and_a_taken_port_is_named(app, tmp_path):
+    port = app[1].rstrip("/").rpartition(":")[2]
+    for words, sentence in (
+        (["--host", "0.0.0.0"], "set a password in IGSR_PASSWORD"),
+        (["--port", port], f"port {port}"),
+    ):
+        command = [sys.executable, "-m", "igsr.cli", "app", "--no-browser", *words]
+        done = subprocess.run(
+            [*command, "--out", tmp_path / "scenes"], capture_output=True, text=True, timeout=60
+        )
+        assert done.returncode == 1
+        assert sentence in done.stderr
+        assert "Traceback" not in done.stderr
+    assert not (tmp_path / "scenes").exists()
