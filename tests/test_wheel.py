@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import os
 import platform
@@ -11,9 +12,12 @@ import subprocess
 import sys
 import time
 import zipfile
+from importlib import metadata
 from pathlib import Path
 
+import apps
 import pytest
+from packaging.requirements import Requirement
 from PIL import Image
 from web_views import view_until_ctrl_c
 
@@ -72,6 +76,11 @@ class Clean:
         return result
 
 
+def size_of(folder: Path) -> int:
+    """Bytes of the files in a folder; links are not followed."""
+    return sum(file.lstat().st_size for file in folder.rglob("*"))
+
+
 @pytest.fixture(scope="module")
 def clean(wheel, tmp_path_factory):
     made = Clean(tmp_path_factory.mktemp("clean"), wheel)
@@ -100,14 +109,16 @@ def test_one_wheel_serves_every_python_and_is_small(wheel):
     assert {name.split("/")[0].split("-")[0] for name in names} == {"igsr"}
     needs = [line for line in lines if line.startswith("Requires-Dist: torch")]
     assert needs
-    assert all(re.search(r"extra == ['\"](refine|matching)['\"]", line) for line in needs), needs
+    assert all(re.search(r"extra == ['\"](refine|matching|app)['\"]", line) for line in needs), (
+        needs
+    )
 
 
 def test_torch_is_not_installed(clean):
     installed = json.loads(clean.run("python", "-m", "pip", "list", "--format=json").stdout)
     assert "igsr" in {one["name"] for one in installed}
     assert not {one["name"] for one in installed} & {"torch", "torchmetrics"}
-    size = sum(file.lstat().st_size for file in (clean.folder / "venv").rglob("*"))
+    size = size_of(clean.folder / "venv")
     print(f"{size / 1e6:.0f} MB in the environment")
     assert size < 700e6
 
@@ -160,6 +171,67 @@ def test_the_browser_view_answers_until_ctrl_c(clean, fitted):
     print(f"{time.perf_counter() - started:6.1f} s  igsr view out, answer and end")
     assert status == 0, errors
     assert "There is no display" in errors
+
+
+#: Packages that are linked because they are large; pip will not replace them.
+LINKED = ("torch", "nvidia", "triton")
+
+
+def copy_with_requirements(wanted: Requirement, folder: Path, copied: set[str]) -> None:
+    """Copy an installed package and its requirements."""
+    copied.add(str(wanted))
+    package = metadata.distribution(wanted.name)
+    for top in {Path(file).parts[0] for file in package.files or []} - {"..", "__pycache__"}:
+        source = Path(str(package.locate_file(top)))
+        if (folder / top).exists():
+            continue
+        if top in LINKED:
+            (folder / top).symlink_to(source)
+        elif source.is_dir():
+            shutil.copytree(source, folder / top)
+        else:
+            shutil.copy(source, folder / top)
+    for need in map(Requirement, package.requires or []):
+        extras = {"", *wanted.extras}
+        holds = need.marker is None or any(need.marker.evaluate({"extra": e}) for e in extras)
+        if holds and str(need) not in copied:
+            copy_with_requirements(need, folder, copied)
+
+
+def test_the_commands_of_the_container_serve_the_app(wheel, tmp_path):
+    """All but those for root and for PyTorch, which is copied: PyPI does not have its CPU build."""
+    lines = (ROOT / "examples" / "app" / "Containerfile").read_text().splitlines()
+    commands = [line.partition(" ")[2] for line in lines if line.startswith(("RUN", "CMD"))]
+    of_root, torch, install, user, serve = commands
+    assert of_root.startswith("apt-get")
+    assert torch.startswith("pip install --no-cache-dir torch --index-url")
+    assert user.startswith("useradd")
+    made = Clean(tmp_path, wheel)
+    site = next((tmp_path / "venv").glob("lib/python*/site-packages"))
+    copy_with_requirements(Requirement("torch"), site, set())
+    before = size_of(site)
+    started = time.perf_counter()
+    install = install.replace("/tmp/igsr-*.whl", str(wheel))
+    subprocess.run(["bash", "-c", install], env=made.variables, cwd=tmp_path, check=True)
+    seconds = time.perf_counter() - started
+    print(f"{seconds:.0f} s, {(size_of(site) - before) / 1e6:.0f} MB more for igsr[app]")
+    port = "7898"
+    process = subprocess.Popen(
+        ["bash", "-c", f"exec {serve.replace('7860', port)}"],
+        env={**made.variables, "IGSR_PASSWORD": "secret"},
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert process.stdout.readline().strip() == f"http://0.0.0.0:{port}/"
+        login = ("Authorization", "Basic " + base64.b64encode(b"igsr:secret").decode())
+        address = f"http://127.0.0.1:{port}"
+        assert apps.answered(address)[0] == 401
+        assert apps.answered(address, headers=[login])[0] == 200
+    finally:
+        process.terminate()
+        process.communicate(timeout=30)
 
 
 def test_refine_names_the_extra(clean):
