@@ -79,7 +79,7 @@ def test_photos_make_a_run_that_tabs_share_stop_and_continue(app, tab, photos, t
         tab.open_app(f"{address}?run={name}")
         tab.wait_for_text("Working.")
         tab.press("Stop")
-        tab.wait_for_text("Stopped. Stopped; it continues from its checkpoint.")
+        tab.wait_for_text("Stopped. Continue uses its checkpoint.")
         second.open_app(f"{address}?run={name}")
         second.press("Continue")
         second.wait_for_text("Working.")
@@ -157,6 +157,22 @@ def test_dark_and_blurred_photos_are_named(app, tab, tmp_path, photos):
     tab.open_app(address)
     tab.drop(files)
     assert f"{photos[0].name}: dark" in tab.wait_for_text("dark; add light")
+
+
+def test_without_gradio_the_extra_is_named(tmp_path):
+    (tmp_path / "sitecustomize.py").write_text("import sys\nsys.modules['gradio'] = None\n")
+    path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, "-m", "igsr.cli", "app", "--no-browser"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr == "igsr app needs gradio: pip install 'igsr[app]'.\n"
+    assert [path.name for path in tmp_path.iterdir()] == ["sitecustomize.py"]
 
 
 def test_a_run_is_deleted_only_if_that_is_confirmed(app, tab):

@@ -70,7 +70,7 @@ def test_a_killed_run_becomes_the_scene_that_the_command_makes(tab, tmp_path):
         tab.press("Continue")
         tab.wait_for_text("Working.")
         kill_run(out / name, killed)
-        tab.wait_for_text("Failed.")
+        tab.wait_for_text("Failed. It was killed")
         tab.press("Continue")
         tab.wait_for_text("Done.", timeout=5 * MINUTES)
         text = tab.wait_for_text("Renders of fitted photos are")

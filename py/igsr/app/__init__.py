@@ -41,10 +41,12 @@ def serve(
             "or leave out --host"
         )
     listener = _listen(host, port)
+    # Gradio before its own requirements, so that its extra is named if it is not installed.
+    from igsr.app.server import make_app  # isort: split
+
     import uvicorn
 
     from igsr.app.runs import Runs
-    from igsr.app.server import make_app
 
     runs = Runs(out)
     # Uploads are on the disk of the runs, and not in a folder that other users can see.

@@ -89,7 +89,8 @@ def check_files(files: Sequence[Path]) -> Intake:
             else:
                 intake.taken[name] = file
                 if not _is_video(file):
-                    _link(file, Path(folder) / name)
+                    (Path(folder) / name).parent.mkdir(exist_ok=True)
+                    shutil.copyfile(file, Path(folder) / name)
         photos = _read(Path(folder), intake)
     if others:
         intake.left_out.append(f"{listed(others)}: not a photo or video that igsr can read.")
@@ -120,14 +121,6 @@ def _read(folder: Path, intake: Intake) -> list[Photo]:
         if issubclass(warning.category, UserWarning):
             intake.left_out.append(str(warning.message).replace(f"{folder}{os.sep}", ""))
     return photos
-
-
-def _link(file: Path, target: Path) -> None:
-    target.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        os.link(file, target)
-    except OSError:  # another file system
-        shutil.copyfile(file, target)
 
 
 def _is_video(file: Path) -> bool:

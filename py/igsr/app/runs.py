@@ -261,13 +261,14 @@ class Runs:
             code = current.process.wait()
             with self._lock:
                 del self._current[name]
-                last = self.log(name)[-1:] or ["The process ended without a message."]
                 if code == 0:
                     self._end(name, DONE, "")
                 elif code in _INTERRUPTED:
-                    self._end(name, STOPPED, "Stopped; it continues from its checkpoint.")
+                    self._end(name, STOPPED, "Continue uses its checkpoint.")
+                elif code < 0:
+                    self._end(name, FAILED, "It was killed; the memory may be too small.")
                 else:
-                    self._end(name, FAILED, last[0])
+                    self._end(name, FAILED, (self.log(name) or [f"Exit status {code}."])[-1])
 
     def _launch(self, name: str) -> _Process:
         run = self._stored(name)
