@@ -152,9 +152,13 @@ class Events:
         if run.state != RUNNING:
             return text
         stage, done, left = self._runs.progress(run.name)
-        estimate = self._runs.log(run.name)[-1:] if left is None else [f"{_duration(left)} left."]
         bar = f'<progress value="{done:.3f}"></progress>'
-        return f"{text} {html.escape(stage)}<br>{bar}<br>{html.escape(''.join(estimate))}"
+        if left is None:
+            # The command's estimate, without its advice on options.
+            estimate = "".join(self._runs.log(run.name)[-1:]).partition(";")[0]
+        else:
+            estimate = f"{_duration(left)} left"
+        return f"{text} {html.escape(stage)}<br>{bar}<br>{html.escape(estimate)}"
 
     def _cards(self) -> str:
         cards = []

@@ -12,6 +12,7 @@ from igsr.app.results import MAX_COMPARED
 from igsr.app.runs import QUALITIES, Runs
 
 CSS = """
+.photos .grid-container { grid-template-columns: repeat(auto-fill, minmax(90px, 1fr)) !important; }
 .scene iframe { width: 100%; height: min(70vh, 42rem); border: 0; border-radius: 8px; }
 .scene progress { width: 100%; height: 1rem; }
 .runs { display: flex; flex-wrap: wrap; gap: 1rem; }
@@ -36,7 +37,9 @@ def make_page(runs: Runs) -> gr.Blocks:
             files = gr.File(label="Photos or a video", file_count="multiple", height=200)
             folder = gr.UploadButton("Choose a folder", file_count="directory", size="sm")
             notes = gr.HTML()
-            thumbnails = gr.Gallery(label="Photos", columns=5, height="auto", visible=False)
+            thumbnails = gr.Gallery(
+                label="Photos", height="auto", visible=False, elem_classes="photos"
+            )
             quality = gr.Radio(
                 list(QUALITIES), value="normal", label="Quality", info="Higher takes longer."
             )
