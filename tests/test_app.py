@@ -328,15 +328,19 @@ def test_a_password_guards_every_address(tmp_path):
             assert status("igsr", "Väter", path, host="scenes.example") == 200
 
 
-def test_other_computers_need_a_password_and_a_taken_port_is_named(app, tmp_path):
+def test_an_app_that_cannot_start_says_why(app, tmp_path):
     port = app[1].rstrip("/").rpartition(":")[2]
     for words, sentence in (
         (["--host", "0.0.0.0"], "set a password in IGSR_PASSWORD"),
         (["--port", port], f"port {port}"),
+        (["--out", app[0]], "Another igsr (process"),
     ):
-        command = [sys.executable, "-m", "igsr.cli", "app", "--no-browser", *words]
+        command = [sys.executable, "-m", "igsr.cli", "app", "--no-browser"]
         done = subprocess.run(
-            [*command, "--out", tmp_path / "scenes"], capture_output=True, text=True, timeout=60
+            [*command, "--out", tmp_path / "scenes", *words],
+            capture_output=True,
+            text=True,
+            timeout=60,
         )
         assert done.returncode == 1
         assert sentence in done.stderr

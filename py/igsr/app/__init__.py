@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import shutil
 import socket
 from collections.abc import Callable
 from pathlib import Path
 
+from igsr._internal.folder_lock import folder_lock
 from igsr.errors import IgsrError
 from igsr.rendering.live_server import is_loopback
 
@@ -32,7 +34,7 @@ def serve(
         announce: gets the address.
 
     Raises:
-        IgsrError: the password is missing, or the port is taken.
+        IgsrError: the password is missing, the port is taken, or another app uses the folder.
         OSError: the folder cannot be written.
     """
     if not password and not is_loopback(host):
@@ -48,22 +50,24 @@ def serve(
 
     from igsr.app.runs import Runs
 
-    runs = Runs(out)
-    # Uploads are on the disk of the runs, and not in a folder that other users can see.
-    os.environ["GRADIO_TEMP_DIR"] = str(runs.root / ".uploads")
-    try:
-        config = uvicorn.Config(
-            make_app(runs, password or None),
-            log_level="critical",  # requests that Ctrl-C cancels are errors to it
-            timeout_graceful_shutdown=1,
-            server_header=False,
-        )
-        shown = f"[{host}]" if ":" in host else host
-        announce(f"http://{shown}:{listener.getsockname()[1]}/")
-        uvicorn.Server(config).run(sockets=[listener])
-    finally:
-        runs.close()
-        listener.close()
+    with listener, folder_lock(out):
+        runs = Runs(out)
+        # Uploads are on the disk of the runs, and not in a folder that other users can see.
+        uploads = runs.root / ".uploads"
+        os.environ["GRADIO_TEMP_DIR"] = str(uploads)
+        try:
+            config = uvicorn.Config(
+                make_app(runs, password or None),
+                log_level="critical",  # requests that Ctrl-C cancels are errors to it
+                timeout_graceful_shutdown=1,
+                server_header=False,
+            )
+            shown = f"[{host}]" if ":" in host else host
+            announce(f"http://{shown}:{listener.getsockname()[1]}/")
+            uvicorn.Server(config).run(sockets=[listener])
+        finally:
+            runs.close()
+            shutil.rmtree(uploads, ignore_errors=True)
 
 
 def _listen(host: str, port: int | None) -> socket.socket:
