@@ -21,6 +21,8 @@ _PIXEL_WIDTH, _PLANE_RESOLUTION, _PLANE_UNIT = 0xA002, 0xA20E, 0xA210
 _USER_COMMENT = 0x9286
 _EXPOSURE_TIME, _F_NUMBER, _ISO = 0x829A, 0x829D, 0x8827
 _MM_FROM_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+#: JPEG files hold at most 64 kB; Pillow makes objects of all values.
+_MAX_EXIF_BYTES = 1 << 20
 #: Orientations that exchange width and height.
 TURNED = (5, 6, 7, 8)
 _FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
@@ -54,6 +56,8 @@ class Exif:
 def read_exif(image: Image.Image) -> Exif:
     """Read the EXIF of an open image; its pixels need not be decoded."""
     try:
+        if len(image.info.get("exif", b"")) > _MAX_EXIF_BYTES:
+            raise ValueError("EXIF is too large")
         fields = dict(image.getexif())
         fields.update(image.getexif().get_ifd(_SUB_FOLDER))
     except Exception:  # Pillow raises anything at all on broken EXIF
