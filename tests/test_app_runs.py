@@ -74,7 +74,7 @@ def test_a_killed_run_becomes_the_scene_that_the_command_makes(tab, tmp_path):
         tab.press("Continue")
         tab.wait_for_text("Done.", timeout=5 * MINUTES)
         text = tab.wait_for_text("Renders of fitted photos are")
-        assert "Download: scene.ply" in text
+        assert "Download: page to send (.html)" in text
         tab.wait_for("document.querySelectorAll('.scene img').length >= 4")
         scene = picture(tab, tmp_path / "scene.png")
         middle = scene[len(scene) // 4 : -len(scene) // 4]

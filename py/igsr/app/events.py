@@ -22,7 +22,11 @@ _STATES = {
     FAILED: "Failed",
     DONE: "Done",
 }
-_LABELS = {"scene.html": "page to send (.html)", "report.json": "report (.json)"}
+_LABELS = {
+    "scene.html": "page to send (.html)",
+    "report.html": "report",
+    "scene.mp4": "video (.mp4)",
+}
 
 
 class Events:
@@ -143,7 +147,7 @@ class Events:
             f'<a href="{_address(name, file)}" download>{_LABELS.get(file, file)}</a>'
             for file in (*WRITTEN, *EXPORTS)
         ]
-        return [_paragraphs(in_words(folder, log)) + f"<p>Download: {', '.join(links)}</p>", *pairs]
+        return [_paragraphs(in_words(folder, log)) + f"<p>Download: {' '.join(links)}</p>", *pairs]
 
     def _status(self, run: Run) -> str:
         text = f"<b>{_STATES[run.state]}.</b> {html.escape(run.message)}"

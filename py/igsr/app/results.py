@@ -22,7 +22,7 @@ from igsr.rendering.run_folder import CAMERAS, REPORT, SCENE, VIEW, cameras_of, 
 from igsr.splats import Splats
 
 #: Files that a run writes.
-WRITTEN = (SCENE, "scene.html", "report.html", REPORT)
+WRITTEN = ("scene.html", "report.html", SCENE, REPORT)
 #: Files that are made of them when they are asked for.
 EXPORTS = ("scene.spz", "scene.sog", "scene.mp4")
 _ORBIT_FRAMES = 120
@@ -79,11 +79,9 @@ def in_words(folder: Path, log: Sequence[str]) -> list[str]:
         sentences = [_quality(report, test)]
         missing = photos["not_placed"]
         if missing:
-            sentences.append(
-                f"{len(missing)} of {photos['given']} photos are not placed: {listed(missing)}."
-            )
+            count = f"{len(missing)} of {photos['given']} photos are not placed: {listed(missing)}."
             # The run printed why.
-            sentences += [line for line in log if any(name in line for name in missing)]
+            sentences += [line for line in log if any(name in line for name in missing)] or [count]
         limit = report.get("limit") or {}
         if limit.get("sentence"):
             # Without the options of commands.
