@@ -27,7 +27,7 @@ WRITTEN = ("scene.html", "report.html", SCENE, REPORT)
 EXPORTS = ("scene.spz", "scene.sog", "scene.mp4")
 _ORBIT_FRAMES = 120
 #: PSNR in dB of held-out photos, and how people would call the renders.
-_GRADES = ((32.0, "very sharp"), (28.0, "sharp"), (22.0, "soft"), (-1.0, "blurred"))
+_GRADES = ((32.0, "very sharp"), (28.0, "sharp"), (22.0, "soft"))
 MAX_COMPARED = 4
 
 _making = threading.Lock()
@@ -94,7 +94,7 @@ def in_words(folder: Path, log: Sequence[str]) -> list[str]:
 def _quality(report: dict[str, Any], test: dict[str, float] | None) -> str:
     scores, kind = (test, "held-out") if test else (report["train"], "fitted")
     psnr, ssim = scores["psnr"], scores["ssim"]
-    grade = next(word for least, word in _GRADES if psnr >= least)
+    grade = next((word for least, word in _GRADES if psnr >= least), "blurred")
     return f"Renders of {kind} photos are {grade}: PSNR {psnr:.1f} dB, SSIM {ssim:.3f}."
 
 

@@ -81,7 +81,9 @@ class Run:
 @dataclass
 class _Process:
     process: subprocess.Popen[bytes]
-    first: tuple[float, float] | None = None  # time and fraction of the first progress
+    #: Time and fraction of the first and the last progress.
+    first: tuple[float, float] = (0.0, 0.0)
+    last: tuple[float, float] = (0.0, 0.0)
 
 
 class Runs:
@@ -221,12 +223,11 @@ class Runs:
             current = self._current.get(name)
         if current is None or done == 0.0:
             return text, done, None
-        if current.first is None:
-            current.first = time.monotonic(), done
-        began, first = current.first
-        since = done - first
-        left = (time.monotonic() - began) * (1.0 - done) / since if since > _MIN_FRACTION else None
-        return text, done, left
+        if done != current.last[1]:
+            current.last = time.monotonic(), done
+            current.first = current.first if current.first[1] else current.last
+        seconds, since = (b - a for a, b in zip(current.first, current.last, strict=True))
+        return text, done, seconds * (1.0 - done) / since if since > _MIN_FRACTION else None
 
     def _process(self, name: str, folder: Path) -> int | None:
         current = self._current.get(name)
