@@ -108,7 +108,7 @@ class Events:
             if confirmed:
                 self._runs.delete(name)
 
-    def open(self, request: gr.Request) -> list[Any]:
+    def open_page(self, request: gr.Request) -> list[Any]:
         """Show the run that the address names, or the form for a new scene."""
         name = dict(request.query_params).get("run", "")
         try:

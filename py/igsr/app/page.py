@@ -73,7 +73,7 @@ def make_page(runs: Runs) -> gr.Blocks:
 
         for function in (events.run_state, events.stop_run, events.resume_run):
             gr.api(function)
-        page.load(events.open, None, [name, start, scene, view, cards, clock], **_QUIET)
+        page.load(events.open_page, None, [name, start, scene, view, cards, clock], **_QUIET)
         shown = [drawn, status, stop, resume, delete, log, results, *sliders]
         clock.tick(events.update, [name, drawn], shown, **_QUIET)
         folder.upload(lambda chosen: chosen, folder, files, **_QUIET)

@@ -277,7 +277,8 @@ class Runs:
         resumes = (folder / LOG).exists()
         self._store(replace(run, state=RUNNING, message=""))
         command = [sys.executable, "-m", "igsr.cli", *run.words(folder, resumes=resumes)]
-        with open(folder / LOG, "wb") as log:
+        (folder / LOG).unlink(missing_ok=True)  # it may be a link
+        with (folder / LOG).open("xb") as log:
             process = subprocess.Popen(
                 command,
                 stdin=subprocess.DEVNULL,
