@@ -238,6 +238,34 @@ def test_a_run_cannot_be_deleted_while_it_is_queued(tmp_path, photos):
     again.close()
 
 
+def test_a_queued_run_whose_state_cannot_be_stored_does_not_wait_forever(
+    tmp_path, photos, monkeypatch
+):
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    runs = Runs(tmp_path)
+    with runs._lock:
+        name = runs.create({"a.png": photos[0]}).name
+        monkeypatch.setattr(runs, "_store", full)
+    apps.until(lambda: runs.get(name).state == STOPPED)
+    runs.delete(name)
+    runs.close()
+
+
+def test_a_run_whose_folder_is_removed_does_not_stop_the_queue(tmp_path, photos):
+    runs = Runs(tmp_path)
+    name = runs.create({"a.png": photos[0]}).name
+    apps.until(lambda: name in runs._current)
+    shutil.rmtree(tmp_path / name)
+    assert runs.log(name) == []
+    runs._current[name].process.kill()
+    apps.until(lambda: name not in runs._current)
+    second = runs.create({"a.png": photos[0]}).name
+    apps.until(lambda: second in runs._current)
+    runs.close()
+
+
 def test_files_of_a_run_are_served_by_an_allow_list(app, tmp_path):
     out, address = app
     folder = finished_run(out)
@@ -302,9 +330,26 @@ def test_requests_of_other_sites_and_host_names_are_refused(app):
 
 def test_uploads_have_a_limit(app):
     _, address = app
+    chunked = [("Content-Length", "5"), ("Transfer-Encoding", "chunked")]
+    assert apps.answered(address, "/gradio_api/upload", "POST", headers=chunked)[0] == 413
+    assert apps.answered(address, method="HEAD")[0] == 200
     for length, status in (("99999999999", 413), ("9" * 400, 400), ("-1", 400), ("x", 400)):
         headers = [("Content-Length", length)]
         assert apps.answered(address, "/gradio_api/upload", "POST", headers=headers)[0] == status
+
+
+def test_files_of_other_servers_are_not_fetched(app):
+    from gradio_client import Client, handle_file
+    from gradio_client.exceptions import AppError
+
+    _, address = app
+    for path in ("file=https://example.com/a.png", "proxy=https://example.com/a.png"):
+        status, content = apps.answered(address, f"/gradio_api/{path}")
+        assert (status, content) == (403, b"Files of other servers are not fetched.")
+    client = Client(address, verbose=False)
+    photo = handle_file("https://example.com/a.png")
+    with pytest.raises(AppError, match="not fetched"):
+        client.predict([photo], "draft", 0, False, 0, api_name="/make_scene")
 
 
 def test_a_password_guards_every_address(tmp_path):
@@ -322,6 +367,7 @@ def test_a_password_guards_every_address(tmp_path):
         paths = ("/", "/config", f"/runs/{run.name}/files/scene.ply", f"/runs/{run.name}/view/")
         for path in paths:
             assert apps.answered(address, path)[0] == 401
+            assert apps.answered(address, path, headers=[("Authorization", b"\xe4")])[0] == 401
             assert status("igsr", "Vater", path) == 401
             assert status("root", "Väter", path) == 401
             assert status("igsr", "Väter", path) == 200

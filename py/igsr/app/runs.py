@@ -102,9 +102,6 @@ class Runs:
         self._current: dict[str, _Process] = {}
         self._is_closed = threading.Event()
         self._worker = threading.Thread(target=self._work, daemon=True)
-        for name in self.names():
-            if self._stored(name).state == QUEUED:
-                self._store(replace(self._stored(name), state=STOPPED, message="Not started."))
         self._worker.start()
 
     def close(self) -> None:
@@ -167,16 +164,18 @@ class Runs:
         Raises:
             IgsrError: the run does not exist.
         """
-        folder = self.folder(name)
-        run = self._stored(name)
         with self._lock:
-            is_ours = name in self._current
-        if run.state == RUNNING and not is_ours and not _holder(folder):
-            # Its app was killed, and the command has ended since.
-            finished = _is_finished(folder)
-            run = replace(run, state=DONE if finished else STOPPED)
-            run = run if finished else replace(run, message="It was interrupted.")
-        return run
+            folder = self.folder(name)
+            run = self._stored(name)
+            if run.state == QUEUED and name not in self._queue:
+                # Its app has ended, or the disk was full.
+                return replace(run, state=STOPPED, message="Not started.")
+            if run.state == RUNNING and name not in self._current and not _holder(folder):
+                # Its app was killed, and the command has ended since.
+                if _is_finished(folder):
+                    return replace(run, state=DONE)
+                return replace(run, state=STOPPED, message="It was interrupted.")
+            return run
 
     def start(self, name: str) -> None:
         """Queue a run, to start it or to continue it from its checkpoint."""
@@ -211,7 +210,7 @@ class Runs:
         """Return the lines that the command printed."""
         try:
             text = read_file(self.folder(name) / LOG, MAX_LOG_BYTES).decode(errors="replace")
-        except OSError:
+        except (OSError, IgsrError):  # deleted meanwhile
             return []
         return [printable(line) for line in text.splitlines() if line.strip()]
 

@@ -45,14 +45,14 @@ class _Guard:
     def __init__(self, app: Any, password: str | None) -> None:
         self._app = app
         login = base64.b64encode(f"{USER}:{password}".encode()).decode()
-        self._login = None if password is None else f"Basic {login}"
+        self._login = None if password is None else f"Basic {login}".encode()
 
     async def __call__(self, scope: _Message, receive: _Receive, send: _Send) -> None:
         if scope["type"] != "http":
             if scope["type"] == "lifespan":
                 await self._app(scope, receive, send)
             return
-        refusal = self._refusal(scope["method"], Headers(scope=scope))
+        refusal = self._refusal(scope, Headers(scope=scope))
         if refusal is not None:
             await refusal(scope, receive, send)
             return
@@ -69,13 +69,13 @@ class _Guard:
 
         await self._app(scope, receive, with_policy)
 
-    def _refusal(self, method: str, headers: Headers) -> Response | None:
+    def _refusal(self, scope: _Message, headers: Headers) -> Response | None:
         host = headers.get("host", "")
         if self._login is None:
             # A foreign name that leads to this computer would let other sites read the answers.
             if not is_loopback(re.sub(r":[0-9]*$", "", host).strip("[]")):
                 return PlainTextResponse("Open the address that igsr app printed.", 403)
-        elif not hmac.compare_digest(headers.get("authorization", ""), self._login):
+        elif not hmac.compare_digest(headers.get("authorization", "").encode(), self._login):
             return PlainTextResponse(
                 "Sign in with the user igsr and the password.",
                 401,
@@ -84,11 +84,19 @@ class _Guard:
         origin = headers.get("origin")
         if origin is not None and origin.partition("://")[2] != host:
             return PlainTextResponse("This request comes from another site.", 403)
-        # Uvicorn receives no more than the length that a request names.
-        length = headers.get("content-length", "0" if method == "GET" else "")
-        if not length.isdecimal() or int(length) > MAX_REQUEST_BYTES:
+        if "://" in scope["path"]:
+            # Gradio would fetch a file from there, which may be a page with a script.
+            return PlainTextResponse("Files of other servers are not fetched.", 403)
+        # Uvicorn receives no more than the length that a request names, unless it is in chunks.
+        length = headers.get("content-length", "0" if scope["method"] in ("GET", "HEAD") else "")
+        is_chunked = "transfer-encoding" in headers
+        if is_chunked or not length.isdecimal() or int(length) > MAX_REQUEST_BYTES:
             return PlainTextResponse("The upload is too large, or does not name its length.", 413)
         return None
+
+
+async def _no_request(url: str) -> Any:
+    raise gr.Error("Files of other servers are not fetched.", print_exception=False)
 
 
 def make_app(runs: Runs, password: str | None = None) -> Any:
@@ -129,6 +137,8 @@ def make_app(runs: Runs, password: str | None = None) -> Any:
             return PlainTextResponse(str(error), 404)
         return FileResponse(path, filename=file)
 
+    # Calls may name an address in place of an uploaded file.
+    gr.processing_utils.async_ssrf_protected_get = _no_request
     page = make_page(runs)
     gr.mount_gradio_app(
         app,
