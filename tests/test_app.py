@@ -302,6 +302,24 @@ def test_files_of_a_run_are_served_by_an_allow_list(app, tmp_path):
     (out / "20260101-120000-bbbbbb").unlink()
 
 
+def test_a_view_answers_while_others_are_opened(tmp_path, monkeypatch):
+    from starlette.testclient import TestClient
+
+    from igsr.app import server
+
+    used = []
+    monkeypatch.setattr(
+        server, "answer", lambda view, *_: used.append(view) or ("text/plain", b"", 200)
+    )
+    runs = Runs(tmp_path)
+    client = TestClient(server.make_app(runs), "http://127.0.0.1")
+    for number in range(server.MAX_VIEWS + 1):
+        name = finished_run(tmp_path, f"20260101-12000{number}-abcdef").name
+        assert client.get(f"/runs/{name}/view/photo?number=0").status_code == 200
+    assert used[0]._decoder.submit(int).result() == 0
+    runs.close()
+
+
 def test_names_of_uploads_stay_in_their_folder(app):
     out, address = app
     form = (

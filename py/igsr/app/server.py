@@ -116,7 +116,7 @@ def make_app(runs: Runs, password: str | None = None) -> Any:
             view = views.pop(name, None) or LiveView([folder])
             views[name] = view
             while len(views) > MAX_VIEWS:
-                views.popitem(last=False)[1].close()
+                views.popitem(last=False)  # not closed: another request may use it
         return view
 
     @app.get("/runs/{name}/view/{item}")
