@@ -253,6 +253,15 @@ def test_a_queued_run_whose_state_cannot_be_stored_does_not_wait_forever(
     runs.close()
 
 
+def test_a_damaged_state_is_a_failed_run(tmp_path):
+    runs = Runs(tmp_path)
+    folder = finished_run(tmp_path)
+    for text in ("", "[]", '{"name": "x"}', json.dumps({"name": folder.name, "state": "x"})):
+        (folder / "app.json").write_text(text)
+        assert runs.get(folder.name).message == "app.json cannot be read."
+    runs.close()
+
+
 def test_a_run_whose_folder_is_removed_does_not_stop_the_queue(tmp_path, photos):
     runs = Runs(tmp_path)
     name = runs.create({"a.png": photos[0]}).name
@@ -354,6 +363,8 @@ def test_uploads_have_a_limit(app):
     for length, status in (("99999999999", 413), ("9" * 400, 400), ("-1", 400), ("x", 400)):
         headers = [("Content-Length", length)]
         assert apps.answered(address, "/gradio_api/upload", "POST", headers=headers)[0] == status
+    large = [("Content-Length", "99999999")]
+    assert apps.answered(address, "/gradio_api/queue/join", "POST", headers=large)[0] == 413
 
 
 def test_files_of_other_servers_are_not_fetched(app):
@@ -371,6 +382,8 @@ def test_files_of_other_servers_are_not_fetched(app):
 
 
 def test_a_password_guards_every_address(tmp_path):
+    from gradio_client import Client
+
     folder = tmp_path / "scenes"
     folder.mkdir()
     run = finished_run(folder)
@@ -390,6 +403,7 @@ def test_a_password_guards_every_address(tmp_path):
             assert status("root", "Väter", path) == 401
             assert status("igsr", "Väter", path) == 200
             assert status("igsr", "Väter", path, host="scenes.example") == 200
+        Client(address, verbose=False, httpx_kwargs={"auth": ("igsr", "Väter")})
 
 
 def test_an_app_that_cannot_start_says_why(app, tmp_path):

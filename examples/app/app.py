@@ -1,4 +1,7 @@
-"""A Hugging Face Space; its secret IGSR_PASSWORD is the password of the user igsr."""
+"""A Hugging Face Space: open its .hf.space address.
+
+Its secret IGSR_PASSWORD is the password of the user igsr.
+"""
 
 import os
 from pathlib import Path

@@ -144,7 +144,7 @@ class Events:
         pairs: list[Any] = [gr.update(value=pair, visible=True) for pair in comparisons(folder)]
         pairs += [gr.update(visible=False)] * (MAX_COMPARED - len(pairs))
         links = [
-            f'<a href="{_address(name, file)}" download>{_LABELS.get(file, file)}</a>'
+            f'<a href="{_address(name, file)}">{_LABELS.get(file, file)}</a>'
             for file in (*WRITTEN, *EXPORTS)
         ]
         return [_paragraphs(in_words(folder, log)) + f"<p>Download: {' '.join(links)}</p>", *pairs]
@@ -168,7 +168,10 @@ class Events:
         cards = []
         for name in self._runs.names():
             when = f"{name[:4]}-{name[4:6]}-{name[6:8]} {name[9:11]}:{name[11:13]}"
-            state = _STATES[self._runs.get(name).state]
+            try:
+                state = _STATES[self._runs.get(name).state]
+            except IgsrError:  # deleted meanwhile
+                continue
             picture = f'<img alt="" loading="lazy" src="runs/{name}/view/photo?number=0">'
             cards.append(f'<a href="?run={name}">{picture}{when}<br>{state}</a>')
         return f'<h2>Scenes</h2><div class="runs">{"".join(cards)}</div>' if cards else ""

@@ -79,7 +79,13 @@ def make_page(runs: Runs) -> gr.Blocks:
         folder.upload(lambda chosen: chosen, folder, files, **_QUIET)
         files.change(events.check, files, [notes, thumbnails], api_visibility="private")
         settings = [quality, holdout, leave_out, seed]
-        make.click(events.make_scene, [files, *settings], made, api_name="make_scene")
+        make.click(
+            events.make_scene,
+            [files, *settings],
+            made,
+            api_name="make_scene",
+            show_progress_on=notes,
+        )
         example.click(events.make_example, settings, made, api_name="make_example")
         made.change(None, made, None, js=_OPEN_RUN, **_QUIET)
         stop.click(events.stop_run, name, None, **_QUIET)

@@ -31,12 +31,13 @@ STATE = "app.json"
 LOG = "log.txt"
 PHOTOS = "photos"
 QUEUED, RUNNING, STOPPED, FAILED, DONE = "queued", "running", "stopped", "failed", "done"
+STATES = (QUEUED, RUNNING, STOPPED, FAILED, DONE)
 QUALITIES = ("draft", "normal", "high")
 #: Names of runs: the time of their creation and random letters.
 _NAME = re.compile(r"[0-9]{8}-[0-9]{6}-[0-9a-f]{6}")
 MAX_LOG_BYTES = 1 << 20
-#: Exit codes of ``igsr`` after SIGINT and SIGTERM.
-_INTERRUPTED = (130, 143, -signal.SIGINT, -signal.SIGTERM)
+#: Exit codes of ``igsr`` after SIGINT and SIGTERM; on Windows, the signal.
+_INTERRUPTED = (130, 143, -signal.SIGINT, -signal.SIGTERM, signal.SIGTERM)
 #: Progress from which the time left is estimated.
 _MIN_FRACTION = 0.02
 _POLL_S = 0.5
@@ -194,9 +195,9 @@ class Runs:
                 self._queue.remove(name)
                 self._store(replace(self._stored(name), state=STOPPED, message="Not started."))
             elif process := self._process(name, folder):
-                self._store(replace(self._stored(name), message="Stopping."))
-                with contextlib.suppress(OSError):  # it has ended
+                with contextlib.suppress(OSError):  # it has ended, or the disk is full
                     os.kill(process, signal.SIGTERM)
+                    self._store(replace(self._stored(name), message="Stopping."))
 
     def delete(self, name: str) -> None:
         """Delete a run that is not running, with its photos."""
@@ -236,7 +237,7 @@ class Runs:
         try:
             values = read_json(self.folder(name) / STATE)
             run = Run(**{key: values[key] for key in asdict(Run(name)) if key in values})
-            if run.name == name and run.quality in QUALITIES and isinstance(run.photos, int):
+            if run.name == name and run.quality in QUALITIES and run.state in STATES:
                 return run
         except (OSError, ValueError, TypeError, KeyError):
             pass

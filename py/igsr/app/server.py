@@ -26,8 +26,9 @@ from igsr.rendering.live_view import LiveView
 USER = "igsr"
 #: Views of runs that are kept open; each may hold a few packed models.
 MAX_VIEWS = 4
-#: The files and the text of a form.
-MAX_REQUEST_BYTES = MAX_BYTES + (1 << 20)
+#: The files and the text of a form; other requests are kept in memory.
+MAX_UPLOAD_BYTES = MAX_BYTES + (1 << 20)
+MAX_CALL_BYTES = 1 << 24
 #: Pages load nothing from elsewhere, and no other site shows them in a frame.
 _POLICY = (
     "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; "
@@ -90,7 +91,8 @@ class _Guard:
         # Uvicorn receives no more than the length that a request names, unless it is in chunks.
         length = headers.get("content-length", "0" if scope["method"] in ("GET", "HEAD") else "")
         is_chunked = "transfer-encoding" in headers
-        if is_chunked or not length.isdecimal() or int(length) > MAX_REQUEST_BYTES:
+        most = MAX_UPLOAD_BYTES if scope["path"].endswith("/upload") else MAX_CALL_BYTES
+        if is_chunked or not length.isdecimal() or int(length) > most:
             return PlainTextResponse("The upload is too large, or does not name its length.", 413)
         return None
 
