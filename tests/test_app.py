@@ -14,8 +14,10 @@ from pathlib import Path
 import apps
 import pytest
 from PIL import Image
+from test_photo_folder import film, write_video
 
-from igsr.app.intake import MAX_FILES
+from igsr.app.events import Events
+from igsr.app.intake import MAX_FILES, check_files
 from igsr.app.runs import DONE, QUEUED, STOPPED, Run, Runs
 from igsr.errors import IgsrError
 
@@ -189,6 +191,16 @@ def test_a_run_is_deleted_only_if_that_is_confirmed(app, tab):
     tab.press("Delete")
     tab.wait_for_text("A scene from photos")
     assert not folder.exists()
+
+
+def test_videos_are_taken_and_other_files_left_out(tmp_path, photos):
+    write_video(tmp_path / "walk.MP4", film(20, {7}))
+    (tmp_path / "notes.txt").write_text("notes")
+    files = [str(tmp_path / "walk.MP4"), str(tmp_path / "notes.txt"), str(photos[0])]
+    notes, _ = Events(None).check(files)
+    assert "1 photo and 1 video can be used." in notes
+    assert "notes.txt: not a photo or video" in notes
+    assert sorted(check_files([*map(Path, files)]).taken) == [photos[0].name, "walk.MP4"]
 
 
 def test_programs_call_documented_names(app):

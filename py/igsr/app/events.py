@@ -42,9 +42,11 @@ class Events:
         with _shown_errors():
             intake = check_files([Path(file) for file in files])
         count = len(intake.thumbnails)
-        lines = [f"{count} {'photo' if count == 1 else 'photos'} can be used.", *intake.left_out]
+        counts = {"photo": count, "video": intake.videos}
+        parts = [f"{n} {kind}{'s' if n > 1 else ''}" for kind, n in counts.items() if n]
+        lines = [f"{' and '.join(parts)} can be used."] if parts else []
         pictures = gr.update(value=intake.thumbnails, visible=bool(count))
-        return _paragraphs([*lines, *intake.advice]), pictures
+        return _paragraphs([*lines, *intake.left_out, *intake.advice]), pictures
 
     def make_scene(
         self, files: list[str] | None, quality: str, holdout: int, leave_out: bool, seed: int

@@ -55,9 +55,14 @@ class Intake:
     advice: list[str] = field(default_factory=list)
 
     @property
+    def videos(self) -> int:
+        """The number of videos."""
+        return sum(map(_is_video, self.taken.values()))
+
+    @property
     def can_run(self) -> bool:
         """Whether there are enough photos."""
-        return len(self.thumbnails) >= MIN_PHOTOS or any(map(_is_video, self.taken.values()))
+        return len(self.thumbnails) >= MIN_PHOTOS or self.videos > 0
 
 
 def check_files(files: Sequence[Path]) -> Intake:
@@ -101,7 +106,7 @@ def check_files(files: Sequence[Path]) -> Intake:
     if not intake.can_run:
         have = "Only one photo can be used" if intake.taken else "No photo can be used"
         intake.advice.insert(0, f"{have}; a scene needs at least two that overlap. {HOW_TO}")
-    elif len(kept) < _FEW and not any(map(_is_video, intake.taken.values())):
+    elif len(kept) < _FEW and not intake.videos:
         intake.advice.append(f"{len(kept)} photos are few. {HOW_TO}")
     return intake
 
