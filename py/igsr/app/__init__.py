@@ -10,11 +10,10 @@ from pathlib import Path
 
 from igsr._internal.folder_lock import folder_lock
 from igsr.errors import IgsrError
-from igsr.rendering.live_server import is_loopback
+from igsr.rendering.live_server import is_loopback, listening
 
-#: The default port, and how many to try if it is taken.
+#: The default port.
 PORT = 7860
-PORTS_TO_TRY = 20
 
 
 def serve(
@@ -42,7 +41,13 @@ def serve(
             f"Other computers can reach {host}: set a password in IGSR_PASSWORD, "
             "or leave out --host"
         )
-    listener = _listen(host, port)
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    listener = listening(
+        lambda number: socket.create_server((host, number), family=family, backlog=1024),
+        host,
+        port,
+        PORT,
+    )
     # Gradio before its own requirements, so that its extra is named if it is not installed.
     from igsr.app.server import make_app  # isort: split
 
@@ -68,16 +73,3 @@ def serve(
         finally:
             runs.close()
             shutil.rmtree(uploads, ignore_errors=True)
-
-
-def _listen(host: str, port: int | None) -> socket.socket:
-    ports = range(PORT, PORT + PORTS_TO_TRY) if port is None else (port,)
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    for number in ports:
-        try:
-            return socket.create_server((host, number), family=family, backlog=1024)
-        except OSError as error:
-            reason = error.strerror or str(error)
-    raise IgsrError(
-        f"Cannot listen at {host}, port {ports[0]} ({reason}); name another with --host or --port"
-    )

@@ -22,13 +22,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any
+from typing import Any, TypeVar
 from urllib.parse import parse_qs
 
 from igsr.errors import IgsrError
 from igsr.rendering.live_view import LiveView
 
 logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 #: The default port, and how many to try if it is taken.
 PORT = 8765
@@ -272,10 +274,25 @@ def open_server(view: LiveView, host: str, port: int | None) -> ViewServer:
         host: address of this computer to listen at.
         port: None takes ``PORT``, or the next free one.
     """
-    ports = range(PORT, PORT + PORTS_TO_TRY) if port is None else (port,)
+    return listening(lambda number: ViewServer(view, host, number), host, port, PORT)
+
+
+def listening(open_at: Callable[[int], T], host: str, port: int | None, first: int) -> T:
+    """Return the result of ``open_at`` for a port.
+
+    Args:
+        open_at: listens at a port, or raises an OSError.
+        host: for the error message.
+        port: None takes ``first``, or the next free one.
+        first: the default port.
+
+    Raises:
+        IgsrError: the port is taken, or the host is not of this computer.
+    """
+    ports = range(first, first + PORTS_TO_TRY) if port is None else (port,)
     for number in ports:
         try:
-            return ViewServer(view, host, number)
+            return open_at(number)
         except OSError as error:
             reason = error.strerror or str(error)
     raise IgsrError(
